@@ -68,6 +68,27 @@ def dummy() -> tuple[sysid.Structure, float]:
     return structure, length
 
 
+def spacecraft(modes: int, channels: int = 18) -> sysid.Structure:
+    """The dummy on a base that moves in x, y and z, with so many modes and accelerometers, three at a node."""
+    frame = _frame()
+    mass, stiffness = (np.asarray(matrix) for matrix in frame.matrices())
+    rigid = rigid_motion(np.asarray(NODES), (0.0, 0.0, 0.0))[:, :3]
+    free = np.arange(6 * len(BASE), 6 * len(NODES))
+    lam, shapes = scipy.linalg.eigh(
+        stiffness[np.ix_(free, free)], mass[np.ix_(free, free)], subset_by_index=[0, modes - 1]
+    )
+    participation = shapes.T @ (mass @ rigid)[free]
+    nodes = (13, 12, 14, 15, 16, 8, 5, 10)
+    at = [(node, axis) for node in nodes for axis in "xyz"][:channels]
+    seen = np.array([6 * node + BASE_AXES.index(axis) for node, axis in at])
+    M = np.block([[np.eye(modes), participation], [participation.T, rigid.T @ mass @ rigid]])
+    K = scipy.linalg.block_diag(np.diag(lam), np.zeros((3, 3)))
+    return sysid.Structure(
+        M, K, np.linspace(*DAMPING, modes), n_base=3, rigid_body=rigid[seen], recovery=shapes[seen - free[0]],
+        sensors=[sysid.Sensor(f"node {node} {axis}", NODES[node], axis) for node, axis in at],
+    )  # fmt: skip
+
+
 def _frame() -> Frame:
     main, brace = _tube(0.056, 0.0029), _tube(0.043, 0.0019)
     deck, boom, arm = _tube(0.063, 0.0029), _tube(0.056, 0.0029), _tube(0.046, 0.0023)

@@ -11,7 +11,7 @@ between its samples: ``q = Im(z) / w_d`` with ``z' = lambda z + f``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import gcd
 
 import numpy as np
@@ -60,7 +60,7 @@ class Modes:
         rigid = np.vstack([G, np.eye(structure.n_base)])
         return cls(
             omega, np.diag(loss) / (2 * omega), vectors.T @ (M[:n, :n] @ G + M[:n, n:]),
-            structure.recovery @ vectors, structure.recovery @ G, rigid.T @ M @ rigid,
+            structure.recovery @ vectors, structure.rigid_body, rigid.T @ M @ rigid,
         )  # fmt: skip
 
     @property
@@ -295,6 +295,35 @@ class Setting:
     def with_noise(self, records: Records, rng: np.random.Generator) -> tuple[Records, Levels]:
         """Records with noise of this setting, and its levels."""
         return with_noise(records, rng, self.noise, self.base_noise)
+
+
+def softened(run: Run, share: float, factor: int = 8) -> Records:
+    """Records of a run whose first natural frequency falls by a share of it along the record, from rest in that mode.
+
+    The mode's equation is solved from step to step at `factor` times the rate, its stiffness constant in each and the
+    load that of its middle: the error falls with the square of the step.
+    """
+    modes, motion = run.modes, run.motion
+    still = replace(modes, gamma=np.vstack([np.zeros((1, modes.gamma.shape[1])), modes.gamma[1:]]))
+    others = Run(still, motion, np.concatenate([[0.0], run.free[1:]])).records()
+    base = motion.in_time(motion.amplitudes, factor)
+    load, step = -modes.gamma[0] @ base, 1 / (factor * motion.sample_rate)
+    omega = modes.omega[0] * (1 - share * np.arange(load.size) / load.size)
+    damper = 2 * modes.zeta[0] * modes.omega[0]
+    pole = -damper / 2 + 1j * np.sqrt(omega**2 - damper**2 / 4)
+    passed = np.exp(pole * step)
+    q, v, acceleration = 0.0, 0.0, np.empty(load.size)
+    for i, (w, a, f) in enumerate(zip(omega, passed, load, strict=True)):
+        acceleration[i] = f - damper * v - w**2 * q
+        middle = (f + load[min(i + 1, load.size - 1)]) / 2 / w**2  # displacement that the load holds it at
+        z = a * (v - pole[i].conjugate() * (q - middle))  # v - pole* q oscillates as exp(pole t)
+        q, v = middle + z.imag / pole[i].imag, (pole[i] * z).imag / pole[i].imag
+    a = acceleration[::factor][: motion.samples]
+    return replace(
+        others,
+        response=others.response + modes.shapes[:, :1] * a,
+        force=others.force + modes.gamma[0][:, None] * a,
+    )
 
 
 STOREY_MASSES = (560.0, 500.0, 460.0, 420.0)  # kg, from the ground

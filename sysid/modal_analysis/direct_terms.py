@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
+from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.relocation import Blocks, relocate
-from sysid.modal_analysis.residues import Records, unit_columns
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
@@ -163,7 +164,7 @@ class _Fit:
 def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     """Linear least squares on given poles; the slopes per rad/s."""
     direct = records.basis(_without_poles(records.freq), records.driven)
-    functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True)]))
+    functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True).dense()]))
     Q, R = np.linalg.qr(functions)
     answered = Q.T @ records.data
     left = records.data - Q @ answered

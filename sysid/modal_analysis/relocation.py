@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sysid.modal_analysis.residues import Records, unit_columns
+from sysid.modal_analysis.pole_functions import unit_columns
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT

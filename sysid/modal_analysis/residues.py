@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
+from sysid.modal_analysis.pole_functions import Basis, Beside, OfRun, PoleFunctions, orthonormal, unit_columns
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance
@@ -25,20 +25,20 @@ class ResidueFit:
 
     Attributes
     ----------
-    Q : (rows, columns)
+    basis : Basis
         Orthonormal basis of the functions of the poles.
     residues : (m, inputs, channels)
     spread : (m, inputs, columns)
-        Residues that one unit of each column of Q makes: scatter of the residues is ``spread @ spread'``.
+        Residues that one unit of each column of the basis makes: scatter of the residues is ``spread @ spread'``.
     data : (rows, channels)
         The records.
     answered : (columns, channels)
-        ``Q' data``.
+        Products of the basis with the data.
     size : float
         Sum of squares of the records.
     """
 
-    Q: Array
+    basis: Basis
     residues: Array
     spread: Array
     data: Array
@@ -48,7 +48,7 @@ class ResidueFit:
     @cached_property
     def left(self) -> Array:
         """Records less the contributions of the poles, (rows, channels)."""
-        return self.data - self.Q @ self.answered
+        return self.data - self.basis.times(self.answered)
 
     @cached_property
     def whitened(self) -> Array:
@@ -64,9 +64,17 @@ class ResidueFit:
         """Sum of squares of what is left."""
         return self._difference if self._is_large else float(np.vdot(self.left, self.left))
 
-    def products(self, columns: Array) -> Array:
-        """Products of columns (rows, k) that are orthogonal to Q with what is left, (k, channels)."""
-        return columns.T @ (self.data if self._is_large else self.left)
+    @property
+    def Q(self) -> Array:  # noqa: N802
+        """Orthonormal basis (rows, columns) of a test whose runs share all functions."""
+        assert not self.basis.own
+        return self.basis.shared
+
+    def beside(self, functions: PoleFunctions) -> tuple[Beside, Array]:
+        """What the fit leaves of other functions, and their products with what is left of the data, (columns, c)."""
+        beside = self.basis.beside(functions)
+        of_shared = beside.shared.T @ (self.data if self._is_large else self.left)
+        return beside, beside.products(of_shared, self.left) if beside.own else of_shared
 
     @cached_property
     def _difference(self) -> float:
@@ -162,27 +170,51 @@ class Records:
             out.append((moving, ends[np.any(ends, axis=1)], right[keep] @ channels))
         return out
 
-    def functions(self, omega: Array, ratios: Array, *, velocity: bool = False) -> Array:
+    def functions(self, omega: Array, ratios: Array, *, velocity: bool = False) -> PoleFunctions:
         """Columns of ``g`` for each input; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
         every = gains_with_velocity(self.freq, omega, ratios) if velocity else [gains(self.freq, omega, ratios)]
         return self.of_poles(list(every))
 
-    def of_poles(self, functions: list[ComplexArray]) -> Array:
+    def of_poles(self, functions: list[ComplexArray]) -> PoleFunctions:
         """Columns of functions of poles, (m, n_freq) each, the first for all inputs and a further one for the base's.
 
         Velocities of the motion at the ends are combinations of what is there already.
         """
-        parts = [self.basis(f, None if i == 0 else self.driven) for i, f in enumerate(functions)]
-        by_pole = [part.reshape(len(part), len(functions[0]), -1) for part in parts]
-        return np.concatenate(by_pole, axis=2).reshape(len(parts[0]), -1)
+        rows, m = len(self.data), len(functions[0])
+        shared = [self.basis(functions[0], self._shared), *(self.basis(f, self.driven) for f in functions[1:])]
+        count, r = len(self.base), self.driven
+        inputs = np.concatenate([np.arange(self._shared), count + np.arange(r * (len(functions) - 1))])
+        own = []
+        for both, at in self._ends:
+            lines = both[: both.size // 2]
+            columns = functions[0][:, None, self.line[lines]] * self.base[np.ix_(at, lines)]
+            own.append(OfRun(both, at, stacked(columns.reshape(-1, lines.size))))
+        return PoleFunctions(
+            np.concatenate([part.reshape(rows, m, -1) for part in shared], axis=2).reshape(rows, -1), inputs, own
+        )
+
+    @property
+    def _shared(self) -> int:
+        """Inputs that are not of one run among several."""
+        return self.driven if len(self.blocks) > 1 else len(self.base)
+
+    @cached_property
+    def _ends(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Rows of each run in motion at its ends, and the inputs that this motion makes."""
+        of_ends, found = self.base[self._shared :] != 0, []
+        for run, rows in enumerate(self.rows_of_runs):
+            at = self._shared + np.flatnonzero(np.any(of_ends[:, self.run == run], axis=1))
+            if at.size:
+                found.append((rows, at))
+        return found
 
     def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
         """Best real residues of `functions`."""
-        return _least_squares(self.functions(omega, ratios, velocity=velocity), self.data, omega.size, self.size)
+        return _least_squares(self.functions(omega, ratios, velocity=velocity), self.data, self.size)
 
     def leverage(self, omega: Array, ratios: Array) -> Array:
         """Share of each line's own part in what poles and free residues of both kinds make of it, (n_freq,)."""
-        Q = np.linalg.qr(unit_columns(self.functions(omega, ratios, velocity=True))[0])[0]
+        Q = np.linalg.qr(unit_columns(self.functions(omega, ratios, velocity=True).dense())[0])[0]
         return self.largest(np.sum(Q**2, axis=1).reshape(2, -1).mean(axis=0))
 
     def largest(self, values: Array) -> Array:
@@ -206,6 +238,12 @@ class Records:
     def lengths(self) -> NDArray[np.intp]:
         """Number of lines of each run."""
         return np.bincount(self.run, minlength=len(self.blocks))
+
+    @property
+    def rows_of_runs(self) -> list[NDArray[np.intp]]:
+        """Rows of each run: real parts of its lines, then imaginary ones."""
+        lines = np.split(np.arange(self.line.size), np.cumsum(self.lengths)[:-1])
+        return [np.concatenate([one, one + self.line.size]) for one in lines]
 
     def in_runs(self, rows: Array) -> ComplexArray:
         """Rows of the records, real parts above imaginary ones, as complex lines (runs, lines, columns).
@@ -249,20 +287,19 @@ class SubsetFits:
     """
 
     def __init__(self, records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> None:
-        X, _ = unit_columns(records.functions(omega, ratios, velocity=velocity))
-        Q, R = np.linalg.qr(X)
+        functions = records.functions(omega, ratios, velocity=velocity)
+        basis, R, _ = orthonormal(functions)
         self.records, self.size = records, omega.size
-        self.per_pole = X.shape[1] // omega.size * records.data.shape[1] + 2
-        self._columns = R.reshape(len(R), omega.size, -1)  # by pole; no gain depends on their scale
-        self._answered = Q.T @ records.data
-        left = records.data - Q @ self._answered
+        self.per_pole = functions.count * records.data.shape[1] + 2
+        by_pole = functions.in_order([R.T]).T  # no gain depends on the scale of columns
+        self._columns = by_pole.reshape(len(R), omega.size, -1)
+        self._answered = basis.answers(records.data)
+        left = records.data - basis.times(self._answered)
         self._size = float(np.vdot(self._answered, self._answered))
         self._outside = float(np.sum(left**2))
         # Products of errors `left + Q z` with their neighbours in each run: constant, linear, quadratic in z; by lag.
-        ours, basis = records.in_runs(left), records.in_runs(Q)
-        self._constant, self._chance = _autocorrelation(ours)  # chance as in the fit on all poles
-        self._linear = _lagged(lambda lag: _products(basis, ours, lag) + _products(ours, basis, lag).swapaxes(1, 2))
-        self._quadratic = _lagged(lambda lag: _products(basis, basis, lag))
+        self._constant, self._chance = _autocorrelation(records.in_runs(left))  # chance as in the fit on all poles
+        self._runs = [_of_errors(*basis.of_run(rows), left[rows]) for rows in records.rows_of_runs]
 
     def worth(self, kept: NDArray[np.intp]) -> tuple[Array, float]:
         """Rise of the squared error of the poles `kept` without each, over the noise, (len(kept),).
@@ -275,25 +312,28 @@ class SubsetFits:
             Of this fit.
         """
         X = self._columns[:, kept].reshape(len(self._columns), -1)
-        fit = _least_squares(X, self._answered, kept.size, self._size)
+        fit = _least_squares(PoleFunctions(X, np.arange(X.shape[1] // kept.size)), self._answered, self._size)
         z = fit.left
         squares = z @ z.T
         squared_error = self._outside + float(np.trace(squares))
-        linear = np.einsum("lrkc,kc->lr", self._linear, z)
-        products = self._constant + linear + np.einsum("lrij,ij->lr", self._quadratic, squares)
+        each = [
+            np.einsum("lkc,kc->l", linear, z[at]) + np.einsum("lij,ij->l", quadratic, squares[np.ix_(at, at)])
+            for at, linear, quadratic in self._runs
+        ]
+        products = self._constant + np.array(each).T
         unknowns, records = kept.size * self.per_pole, self.records
         factor = _correlation_factor(products, self._chance, records.data.shape[1], records.lengths, unknowns)
         return fit.gain / records.variance(factor * squared_error, unknowns), squared_error
 
 
-def _lagged(products: Callable[[int], ComplexArray]) -> ComplexArray:
-    """Products at each lag, (lags, ...)."""
-    return np.stack([products(lag) for lag in _LAGS])
+def _of_errors(Q: Array, at: NDArray[np.intp], left: Array) -> tuple[NDArray[np.intp], ComplexArray, ComplexArray]:
+    """Numbers `at` of columns Q of one run, and sums of products of errors ``left + Q z`` with their neighbours.
 
-
-def _neighbours(first: ComplexArray, second: ComplexArray, lag: int) -> tuple[ComplexArray, ComplexArray]:
-    """Lines (runs, n_freq, columns) and, conjugate, those that stand `lag` lines before them in the same run."""
-    return first[:, lag:], second[:, : max(second.shape[1] - lag, 0)].conj()
+    Those linear in z, (lags, columns, channels), and quadratic ones, (lags, columns, columns).
+    """
+    basis, ours = ((rows[: len(rows) // 2] + 1j * rows[len(rows) // 2 :]) for rows in (Q, left))
+    linear = [_products(basis, ours, lag) + _products(ours, basis, lag).T for lag in _LAGS]
+    return at, np.stack(linear), np.stack([_products(basis, basis, lag) for lag in _LAGS])
 
 
 def _autocorrelation(error: ComplexArray) -> tuple[ComplexArray, Array]:
@@ -302,7 +342,8 @@ def _autocorrelation(error: ComplexArray) -> tuple[ComplexArray, Array]:
     Products at two lines are independent where the noise is white, whatever channels share and however lines differ:
     the variance of their sum, relative to the squared power of the run, is that of their squares.
     """
-    each = [np.einsum("rfc,rfc->rf", *_neighbours(error, error, lag)) for lag in _LAGS]
+    before = [error[:, : max(error.shape[1] - lag, 0)].conj() for lag in _LAGS]
+    each = [np.einsum("rfc,rfc->rf", error[:, lag:], early) for lag, early in zip(_LAGS, before, strict=True)]
     sums = np.stack([one.sum(axis=1) for one in each])
     squares = np.stack([np.sum(np.abs(one) ** 2, axis=1) for one in each])
     power = sums[0].real ** 2
@@ -310,20 +351,20 @@ def _autocorrelation(error: ComplexArray) -> tuple[ComplexArray, Array]:
 
 
 def _products(first: ComplexArray, second: ComplexArray, lag: int) -> ComplexArray:
-    """Sums over the lines of each run of products with `_neighbours`, (runs, columns of first, of second)."""
-    late, early = _neighbours(first, second, lag)
-    return late.swapaxes(1, 2) @ early
+    """Sums over the lines of one run of products with those that stand `lag` lines before, (of first, of second)."""
+    return first[lag:].T @ second[: max(len(second) - lag, 0)].conj()
 
 
-def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
-    """Fit of data (rows, channels), whose sum of squares is `size`, on columns X (rows, m * inputs)."""
-    X, size_of_column = unit_columns(X)
-    Q, R = np.linalg.qr(X)
-    y = Q.T @ data
+def _least_squares(functions: PoleFunctions, data: Array, size: float) -> ResidueFit:
+    """Fit of data (rows, channels), whose sum of squares is `size`, on functions of poles."""
+    basis, R, size_of_column = orthonormal(functions)
+    y = basis.answers(data)
     inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
     inverse /= size_of_column[:, None]
-    beta = (inverse @ y).reshape(m, -1, data.shape[1])
-    return ResidueFit(Q, beta, inverse.reshape(m, beta.shape[1], -1), data, y, size)
+    inverse = functions.in_order([inverse])
+    count = functions.count
+    beta = (inverse @ y).reshape(-1, count, data.shape[1])
+    return ResidueFit(basis, beta, inverse.reshape(len(beta), count, -1), data, y, size)
 
 
 def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
@@ -403,13 +444,6 @@ def _singular(matrix: Array) -> tuple[Array, Array]:
     """Singular values and right singular vectors, as rows; the left ones, which are long, are not formed."""
     small = np.linalg.qr(matrix, mode="r") if matrix.shape[0] > matrix.shape[1] else matrix
     return np.linalg.svd(small, full_matrices=False)[1:]
-
-
-def unit_columns(matrix: Array) -> tuple[Array, Array]:
-    """Columns divided by their lengths, and these lengths; one for a column of zeros."""
-    size = np.linalg.norm(matrix, axis=0)
-    size[size == 0] = 1.0
-    return matrix / size, size
 
 
 def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:

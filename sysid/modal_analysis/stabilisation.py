@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.residues import unit_columns
+from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.response import gains, stacked
 from sysid.modal_analysis.vector_fitting import BESIDE
 from sysid.structure.structure import Array, ComplexArray

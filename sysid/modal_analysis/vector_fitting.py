@@ -290,16 +290,16 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
     at = np.concatenate([np.tile(omega, 4) * shift, between])
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
-    plain = records.basis(gains(records.freq, at, loss))
-    size = np.linalg.norm(plain, axis=0)
+    plain = records.functions(at, loss)
+    least_left = NEGLIGIBLE**2 * plain.squares()
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     least = _least_gain(without_velocity)
     for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
         progress.tell()
-        trial = plain - fit.Q @ (fit.Q.T @ plain)
-        left = np.linalg.norm(trial, axis=0)
-        trial = trial / np.where(left > 1e-6 * size, left, np.inf)
-        gain = np.sum(fit.products(trial) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
+        trial, products = fit.beside(plain)
+        left = trial.squares()
+        gain = np.sum(products**2, axis=1) / np.where(left > least_left, left, np.inf)
+        gain = gain.reshape(at.size, -1).sum(axis=1)
         best = int(np.argmax(gain))
         if gain[best] <= least * _noise(records, fit, omega.size):
             continue
@@ -386,9 +386,9 @@ def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array
         moved = np.concatenate([gains(records.freq, omega, ratios), np.zeros((m, records.freq.size))])
         by_pole = np.concatenate([by_pole, (turn * (by_pole[:, 0] - moved))[:, None]], axis=1)
     slopes = records.of_poles([by_pole[:, i] for i in range(by_pole.shape[1])])
-    slopes = slopes - fit.Q @ (fit.Q.T @ slopes)
-    residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
-    d = slopes.shape[1] // (2 * m)
-    H = ((slopes.T @ slopes) * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
-    slope = np.sum(fit.products(slopes) * residues, axis=1).reshape(2 * m, d).sum(axis=1)
+    beside, products = fit.beside(slopes)
+    residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.size, -1)
+    d = slopes.count
+    H = (beside.gram() * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
+    slope = np.sum(products * residues, axis=1).reshape(2 * m, d).sum(axis=1)
     return fit.squared_error, H, slope

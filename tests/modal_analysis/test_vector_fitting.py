@@ -197,7 +197,7 @@ def broadband(truth, freq, runs, noise, rng):
 
 def left_by(records, omega, ratios, velocity):
     """Residual of least squares on these poles, of all channels."""
-    X = records.functions(omega, ratios, velocity=velocity)
+    X = records.functions(omega, ratios, velocity=velocity).dense()
     return records.data - X @ np.linalg.lstsq(X, records.data, rcond=None)[0]
 
 

@@ -1,0 +1,189 @@
+"""Functions of poles at the lines of all runs, and their orthonormal basis.
+
+The motion at the ends of a run makes functions that are zero outside it. They are eliminated within their run, so that
+runs share the functions of the base's motion alone: the cost grows with the number of runs, not with its square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from sysid.structure.structure import Array
+
+
+class OfRun(NamedTuple):
+    """Columns that are zero outside one run: their rows (k,), inputs (i,), and values there (k, m * i)."""
+
+    rows: NDArray[np.intp]
+    inputs: NDArray[np.intp]
+    columns: Array
+
+
+class PoleFunctions(NamedTuple):
+    """Columns of m poles, pole by pole, real parts of all lines above imaginary ones.
+
+    Attributes
+    ----------
+    shared : (rows, m * k)
+        For the inputs of all runs.
+    inputs : (k,)
+        Where these stand among all inputs.
+    own : sequence of OfRun
+        For the inputs of one run each.
+    """
+
+    shared: Array
+    inputs: NDArray[np.intp]
+    own: Sequence[OfRun] = ()
+
+    @property
+    def count(self) -> int:
+        """Inputs of a pole."""
+        return self.inputs.size + sum(one.inputs.size for one in self.own)
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return self.shared.shape[1] // self.inputs.size * self.count
+
+    @property
+    def places(self) -> list[NDArray[np.intp]]:
+        """Where the columns of each run, and last the shared ones, stand pole by pole with all inputs in order."""
+        starts = np.arange(0, self.size, self.count)[:, None]
+        return [(starts + inputs).ravel() for inputs in (*(one.inputs for one in self.own), self.inputs)]
+
+    def in_order(self, parts: Sequence[Array]) -> Array:
+        """Rows that belong to the columns of each run, and last to the shared ones, pole by pole."""
+        return np.concatenate(parts)[np.argsort(np.concatenate(self.places))]
+
+    def squares(self) -> Array:
+        """Sums of squares of the columns, (columns,)."""
+        return self.in_order([np.sum(part**2, axis=0) for part in (*(one.columns for one in self.own), self.shared)])
+
+    def dense(self) -> Array:
+        """All columns written out, (rows, m * inputs)."""
+        out = np.zeros((len(self.shared), self.size))
+        *own, shared = self.places
+        out[:, shared] = self.shared
+        for one, place in zip(self.own, own, strict=True):
+            out[np.ix_(one.rows, place)] = one.columns
+        return out
+
+
+class Basis(NamedTuple):
+    """Orthonormal columns: those of each run (rows, columns), then those of all, (rows, k)."""
+
+    own: list[tuple[NDArray[np.intp], Array]]
+    shared: Array
+
+    def answers(self, data: Array) -> Array:
+        """Products with data (rows, c), (columns, c)."""
+        return np.concatenate([*(Q.T @ data[rows] for rows, Q in self.own), self.shared.T @ data])
+
+    def times(self, answers: Array) -> Array:
+        """Sums of the columns, (rows, c)."""
+        ends = np.cumsum([Q.shape[1] for _, Q in self.own], dtype=int)
+        *own, shared = np.split(answers, ends)
+        out = self.shared @ shared
+        for (rows, Q), part in zip(self.own, own, strict=True):
+            out[rows] += Q @ part
+        return np.asarray(out)
+
+    def of_run(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Rows of one run, without columns that are zero there, and the numbers of those kept."""
+        sizes = [Q.shape[1] for _, Q in self.own]
+        first = np.cumsum([0, *sizes])
+        kept = np.arange(first[-1], first[-1] + self.shared.shape[1])
+        for at, (own_rows, Q) in zip(first[:-1], self.own, strict=True):
+            if own_rows[0] == rows[0]:
+                return np.hstack([Q, self.shared[rows]]), np.concatenate([at + np.arange(Q.shape[1]), kept])
+        return self.shared[rows], kept
+
+    def beside(self, functions: PoleFunctions) -> Beside:
+        """What the basis leaves of other columns of the same runs."""
+        shared = functions.shared - self.times(self.answers(functions.shared))
+        own, mixed = [], []
+        for (rows, Q), (_, _, columns) in zip(self.own, functions.own, strict=True):
+            left = columns - Q @ (Q.T @ columns)
+            own.append((rows, left))
+            mixed.append(self.shared[rows].T @ left)
+        return Beside(functions, shared, own, mixed)
+
+
+class Beside(NamedTuple):
+    """Columns of pole functions less their projections on a `Basis`.
+
+    Shared ones are projected; those of each run only on the run's own part of the basis, `mixed` being their products
+    with its shared part, which are to be taken off.
+    """
+
+    functions: PoleFunctions
+    shared: Array
+    own: list[tuple[NDArray[np.intp], Array]]
+    mixed: list[Array]
+
+    def gram(self) -> Array:
+        """Products of all columns with one another, pole by pole."""
+        *places, shared = self.functions.places
+        if not places:
+            return np.asarray(self.shared.T @ self.shared)
+        order, mixed = np.concatenate(places), np.hstack(self.mixed)
+        out = np.zeros((order.size + shared.size,) * 2)
+        out[np.ix_(order, order)] = -mixed.T @ mixed
+        out[np.ix_(shared, shared)] = self.shared.T @ self.shared
+        for place, (rows, left) in zip(places, self.own, strict=True):
+            out[np.ix_(place, place)] += left.T @ left
+            cross = left.T @ self.shared[rows]
+            out[np.ix_(place, shared)] = cross
+            out[np.ix_(shared, place)] = cross.T
+        return out
+
+    def squares(self) -> Array:
+        """Sums of squares of the columns, (columns,)."""
+        own = zip(self.own, self.mixed, strict=True)
+        parts = [np.sum(left**2, axis=0) - np.sum(mixed**2, axis=0) for (_, left), mixed in own]
+        return self.functions.in_order([*parts, np.sum(self.shared**2, axis=0)])
+
+    def products(self, of_shared: Array, left: Array) -> Array:
+        """Products of all columns with what a fit leaves (rows, c), those of the shared ones given, (columns, c)."""
+        return self.functions.in_order([*(columns.T @ left[rows] for rows, columns in self.own), of_shared])
+
+
+def unit_columns(matrix: Array) -> tuple[Array, Array]:
+    """Columns divided by their lengths, and these lengths; one for a column of zeros."""
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1.0
+    return matrix / size, size
+
+
+def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
+    """Basis of the functions, the triangle R (columns, columns) of their factorisation, and sizes of the columns.
+
+    Columns of ``functions = Q R diag(sizes)`` stand run by run, the shared ones last.
+    """
+    own, sizes, triangles, across = [], [], [], []
+    shared, size_of_shared = unit_columns(functions.shared)
+    for rows, _, columns in functions.own:
+        columns, size = unit_columns(columns)
+        Q, R = np.linalg.qr(columns)
+        own.append((rows, Q))
+        triangles.append(R)
+        sizes.append(size)
+        here, crossing = shared[rows], np.zeros((Q.shape[1], shared.shape[1]))
+        for _ in range(2):  # once leaves round-off of what is nearly in a run's own functions
+            share = Q.T @ here
+            here = here - Q @ share
+            crossing += share
+        shared[rows] = here
+        across.append(crossing)
+    Q, R = np.linalg.qr(shared)
+    first = sum(map(len, triangles))
+    triangle = scipy.linalg.block_diag(*triangles, R)
+    if across:
+        triangle[:first, first:] = np.concatenate(across)
+    return Basis(own, Q), triangle, np.concatenate([*sizes, size_of_shared])
