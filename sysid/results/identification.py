@@ -300,7 +300,7 @@ class Identification(Answer):
             if field.init and field.name not in ("problem", "prepared")
         }
         part = self.part
-        fits = [one.fit for one in self.prepared.modal] if part is None else [part.records.fit]
+        fits = [one.record_fit for one in self.prepared.modal] if part is None else [part.records.fit]
         fits += [None] * (len(problem.tests) - len(fits))
         return type(self)(**kept, problem=problem, prepared=Prepared(problem, fits=fits))
 
