@@ -238,14 +238,15 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
     by = lambda x: x.reshape(*moved.shape[:2], x.shape[-1])  # noqa: E731
     across = by_sensor(moved * by(slopes.T @ column))
-    products = (slopes.T @ slopes).reshape(*moved.shape[:2] * 2)
-    together = np.einsum("kic,kilj,ljc->kl", moved, products, moved, optimize=True)
+    residues = moved.reshape(slopes.shape[1], -1)
+    products = (slopes.T @ slopes) * (residues @ residues.T)
+    together = products.reshape(*moved.shape[:2] * 2).sum(axis=(1, 3))
     inverse = np.linalg.pinv(together, rcond=ROUND_OFF, hermitian=True)
     pull = np.einsum("kic,kic->k", moved, by(slopes.T @ beside))
     normal = np.linalg.inv(np.diag(size) - across.T @ inverse @ across)
     error = normal @ (by_sensor(column * beside) - across.T @ (inverse @ pull))
     steps = inverse @ (pull - across @ error)
-    along = (steps[:, None, None] * moved).reshape(slopes.shape[1], moved.shape[-1])
+    along = (steps[:, None, None] * moved).reshape(residues.shape)
     left = beside - column * np.tile(error, each) - slopes @ along
     of_lines = records.in_runs(left * column)
     by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
