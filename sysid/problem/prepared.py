@@ -47,19 +47,18 @@ class Prepared:
         if modal:
             self.modal = tuple(modal)
 
-    @classmethod
-    def of(cls, stated: StatedProblem, monitor: Monitor | None = None) -> Prepared:
+    def prepare(self, monitor: Monitor | None = None) -> None:
         """Find all that the records tell before any search: modes, noise, poles and weights where they are needed.
 
         Parameters
         ----------
-        stated : StatedProblem
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
-        problem = cls(stated, [fit_modes(test, monitor=monitor) for test in stated.tests])
-        problem.screened = problem._screened(monitor)
-        geometry, formulation = problem.geometry, problem.formulation
+        if "modal" not in vars(self):
+            self.modal = tuple(fit_modes(test, monitor=monitor) for test in self.stated.tests)
+        self.screened = self._screened(monitor)
+        geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
         try:
             _ = formulation.unknowns
@@ -67,7 +66,6 @@ class Prepared:
                 _ = formulation.terms
         finally:
             geometry.monitor = formulation.monitor = None
-        return problem
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
