@@ -98,9 +98,10 @@ def identify(
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
-        named = check_records(problem)
+        prepared = Prepared(problem)
+        named = check_records(prepared)
         with _telling_why(session, named):
-            prepared = prepare(problem, session)
+            prepare(prepared, session)
         with _telling_why(session, named, prepared):
             chosen, why = choose(strategy, prepared, start)
             robust.check_local_phase(prepared, chosen)
@@ -116,19 +117,18 @@ def identify(
     return result
 
 
-def prepare(problem: Problem, session: Session) -> Prepared:
+def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     monitor = session.fit_monitor()
     try:
         with regularly(monitor.check):
-            modal = fit_tests(problem.tests, monitor)
-        if any(one.by_modes for one in modal):
+            problem.modal = fit_tests(problem.stated.tests, monitor)
+        if any(one.by_modes for one in problem.modal):
             session.finish()
-        prepared = Prepared.of(problem, modal, session.preparing)
-        prepared.check()
+        problem.prepare(session.preparing)
+        problem.check()
     except Stop as stop:
         raise SolverError(f"{stop}: nothing is identified") from None
-    return prepared
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
@@ -11,7 +12,7 @@ import casadi as ca
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from threadpoolctl import OpenBLASController, register, threadpool_limits
+from threadpoolctl import OpenBLASController, ThreadpoolController, register
 
 from sysid.errors import listed
 
@@ -70,11 +71,17 @@ register(_BlasOfIpopt)
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Hold NumPy's, SciPy's and IPOPT's linear algebra to one thread: the same bits on any number of processors."""
+    with _blas().limit(limits=1):
+        yield
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    """Libraries of linear algebra, which take milliseconds to find."""
     import scipy.linalg  # noqa: F401 - only libraries that are loaded can be limited
 
     ca.has_nlpsol("ipopt")  # loads it
-    with threadpool_limits(limits=1):
-        yield
+    return ThreadpoolController()
 
 
 class NumpyFunction(ca.Callback):

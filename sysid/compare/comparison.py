@@ -13,6 +13,7 @@ from sysid.compare.method_result import MethodResult, Recorder, Status, errors_o
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify, prepare
 from sysid.nlp import one_thread
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.auto import NAMED
@@ -121,7 +122,8 @@ def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[Met
     """Run one method after the other."""
     with one_thread(), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
-        prepared = prepare(problem, session)
+        prepared = Prepared(problem)
+        prepare(prepared, session)
         strategies = {name: make() for name, make in NAMED.items()}
         refusals = {name: strategy.refusal(prepared, None) for name, strategy in strategies.items()}
         if all(refusals.values()):

@@ -15,8 +15,6 @@ from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT
 
-_FEW = 8  # channels, for which factors take no longer than squares that round-off may refuse
-
 Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Records.principal`
 
 
@@ -44,8 +42,7 @@ def relocate(
         functions = [(numerators[:, None] * base).reshape(-1, w.size), (g[:, None] * ends).reshape(-1, w.size)]
         basis, _ = unit_columns(stacked(np.concatenate(functions)))
         bases.append(np.linalg.qr(basis)[0])
-    few = sum(len(channels) for *_, channels in blocks) <= _FEW
-    rows = None if few else _rows_by_squares(blocks, bases, sigma, tell)
+    rows = _rows_by_squares(blocks, bases, sigma, tell)
     if rows is None:
         rows = _rows_by_factors(blocks, bases, sigma, tell)
     # Relaxation: the sum of Re sigma over the lines is fixed instead of its constant term.
@@ -81,18 +78,24 @@ def _rows_by_squares(
     size = np.sqrt(sum(np.sum(np.abs(channels) ** 2, axis=0) for *_, channels in blocks))
     U, triangle = np.linalg.qr(stacked(size * sigma))
     G = np.eye(len(triangle))
-    real, imaginary = np.split(U, 2)
     share = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    functions = _as_rows(U)
     for (*_, channels), Q in zip(blocks, bases, strict=True):
+        answers = _as_rows(Q).view(float)
         for record in channels:
             tell()
-            a, b = (share * record).real[:, None], (share * record).imag[:, None]
-            answered = Q.T @ np.vstack([a * real - b * imaginary, a * imaginary + b * real])
+            answered = answers @ (share * record * functions).view(float).T
             G -= answered.T @ answered
     values, vectors = np.linalg.eigh(G)
     if values[0] < EXACT:
         return None
     return np.sqrt(values)[:, None] * (vectors.T @ triangle)
+
+
+def _as_rows(columns: Array) -> ComplexArray:
+    """Columns, real parts above imaginary ones, as complex rows."""
+    real, imaginary = np.split(columns.T, 2, axis=1)
+    return np.ascontiguousarray(real + 1j * imaginary)
 
 
 def _zeros(c: Array, omega: Array, ratios: Array) -> tuple[Array, Array]:

@@ -261,7 +261,7 @@ def motion_curvature(
     by = np.stack([(2 * stiff + loss) * over, loss * over])  # slopes of the denominator, over itself
     weight = pull.conj() * -(s**2) * over
     out = np.zeros((len(omega), d + 2, d + 2))
-    out[:, d:, :d] = -np.einsum("akl,kl,jl->kaj", by, weight, base, optimize=True).real
+    out[:, d:, :d] = -((by * weight) @ base.T).real.swapaxes(0, 1)
     out[:, :d, d:] = out[:, d:, :d].swapaxes(1, 2)
     turned = weight * real_times(gamma, base)
     twice = {(0, 0): (4 * stiff + loss) * over, (0, 1): by[1], (1, 1): by[1]}

@@ -56,21 +56,16 @@ class Prepared:
         if modal:
             self.modal = tuple(modal)
 
-    @classmethod
-    def of(cls, stated: StatedProblem, modal: Sequence[ModalEstimate], monitor: Monitor | None = None) -> Prepared:
+    def prepare(self, monitor: Monitor | None = None) -> None:
         """Find what the records tell beside the modes before any search: noise, poles, weights where they are needed.
 
         Parameters
         ----------
-        stated : StatedProblem
-        modal : sequence of ModalEstimate
-            Of each of its tests.
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
-        problem = cls(stated, modal)
-        problem.screened = problem._screened(monitor)
-        geometry, formulation = problem.geometry, problem.formulation
+        self.screened = self._screened(monitor)
+        geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
         try:
             _ = formulation.unknowns
@@ -78,7 +73,6 @@ class Prepared:
                 _ = formulation.terms
         finally:
             geometry.monitor = formulation.monitor = None
-        return problem
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:

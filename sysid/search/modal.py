@@ -23,7 +23,7 @@ from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
-from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
+from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.nlp import IterationMonitor, ended_in_words
@@ -389,7 +389,7 @@ def poles_of(problem: Prepared) -> Poles:
             return poles_near(test, stated, FREQUENCY_WINDOW)
         except InputError as error:
             raise DoesNotApplyError(str(error)) from error
-    found = find_poles(test)
+    found = problem.geometry.poles
     missed = np.array([w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)])
     if missed.size:
         missing, others = (", ".join(f"{w / (2 * np.pi):.5g}" for w in omega) for omega in (missed, found.omega))

@@ -225,7 +225,7 @@ class Structure:
         -------
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
-        return np.einsum("sn,ndf->sdf", self.recovery, self._relative(freq), optimize=True)
+        return np.tensordot(self.recovery, self._relative(freq), 1)
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -241,8 +241,7 @@ class Structure:
         ndarray, complex, shape (d, d, n_freq)
             [force direction, base direction, line].
         """
-        elastic = np.einsum("nd,nef->def", self._coupling, self._relative(freq), optimize=True)
-        return elastic + self.rigid_body_mass[:, :, None]
+        return np.tensordot(self._coupling.T, self._relative(freq), 1) + self.rigid_body_mass[:, :, None]
 
     def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Absolute accelerations of the sensors in time, under a base acceleration given by samples.
@@ -372,7 +371,7 @@ class Structure:
         if self.modal_damping:
             lam = self._omega[:, None]
             g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
-            return np.einsum("nk,kd,kf->ndf", self.normal_modes, self.participation, g, optimize=True)
+            return (self.normal_modes[:, None] * self.participation.T) @ g
         n = self.n
         w = omega[:, None, None]
         dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]

@@ -26,7 +26,6 @@ from sysid.assessment.checks.wrong_records import wrong_records
 from sysid.errors import refuse
 from sysid.finding import Finding, Severity
 from sysid.problem.prepared import Prepared
-from sysid.problem.stated import StatedProblem
 
 CHECKS: tuple[Check, ...] = (
     wrong_records,
@@ -65,15 +64,15 @@ def run(context: Context, checks: Iterable[Check] = CHECKS) -> list[Finding]:
     return context.found
 
 
-def check_records(problem: StatedProblem) -> tuple[Finding, ...]:
-    """Mistakes that records show before a search, the worst first.
+def check_records(problem: Prepared) -> tuple[Finding, ...]:
+    """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
 
     Raises
     ------
     InputError
         Where one is blocking, so that a search would be in vain.
     """
-    found = tuple(run(Context(Prepared(problem))))  # of which nothing is prepared that no check asks for
+    found = tuple(run(Context(problem)))
     refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
     return found
 

@@ -16,7 +16,6 @@ from sysid.assessment.checks.mistakes import MENDED
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.modal_analysis.residues import linear_residues
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
@@ -43,7 +42,7 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
     if not distinguishable or not 0 < len(pairs) <= 15:  # those of six sensors
         return ()
     try:
-        omega, ratios = poles_of_test(test)
+        omega, ratios = problem.geometry.poles.omega, problem.geometry.poles.ratios
         found = [(_residual_of(problem, omega, ratios, pair), pair) for pair in pairs]
         floor = linear_residues(test, omega, ratios)[1]
     except (InputError, np.linalg.LinAlgError):

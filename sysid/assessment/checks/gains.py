@@ -238,18 +238,19 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
     by = lambda x: x.reshape(*moved.shape[:2], x.shape[-1])  # noqa: E731
     across = by_sensor(moved * by(slopes.T @ column))
-    products = (slopes.T @ slopes).reshape(*moved.shape[:2] * 2)
-    together = np.einsum("kic,kilj,ljc->kl", moved, products, moved, optimize=True)
+    residues = moved.reshape(slopes.shape[1], moved.shape[-1])
+    products = (slopes.T @ slopes) * (residues @ residues.T)
+    together = products.reshape(*moved.shape[:2] * 2).sum(axis=(1, 3))
     inverse = np.linalg.pinv(together, rcond=ROUND_OFF, hermitian=True)
     pull = np.einsum("kic,kic->k", moved, by(slopes.T @ beside))
     normal = np.linalg.inv(np.diag(size) - across.T @ inverse @ across)
     error = normal @ (by_sensor(column * beside) - across.T @ (inverse @ pull))
     steps = inverse @ (pull - across @ error)
-    along = (steps[:, None, None] * moved).reshape(slopes.shape[1], moved.shape[-1])
+    along = (steps[:, None, None] * moved).reshape(residues.shape)
     left = beside - column * np.tile(error, each) - slopes @ along
     of_lines = records.in_runs(left * column)
     by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
-    variance = np.array([_variance(errors) for errors in np.moveaxis(by_line, -1, 0)]) / size
+    variance = _variance(by_line) / size
     noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
     noise = np.maximum(noise, EXACT**2 * records.size / left.size)
     if test.response_std is not None and np.any(test.response_std > 0):
@@ -273,16 +274,16 @@ def _rigid_motion(test: Measurement, records: Records) -> Array:
     return np.linalg.pinv(records.moving) @ test.rigid_body.T * records.channel
 
 
-def _variance(products: Array) -> float:
-    """Variance of the sum of products (runs, n_freq) of which lines in a run may share their error.
+def _variance(products: Array) -> Array:
+    """Variance of the sums (k,) of products (runs, n_freq, k) of which lines in a run may share their error.
 
     The largest of what single lines and blocks of them show: noise has no blocks, what a model misses has.
     """
-    runs, lines = products.shape
-    found = [float(np.sum(products**2))]
+    runs, lines = products.shape[:2]
+    found = [np.sum(products**2, axis=(0, 1))]
     for count in _BLOCKS:
         blocks = max(count // runs, 1)
         if lines >= 2 * blocks and blocks * runs > 2:
             sums = np.add.reduceat(products, np.arange(blocks) * lines // blocks, axis=1)
-            found.append(float(np.sum(sums**2)) * sums.size / (sums.size - 1))
-    return max(found)
+            found.append(np.sum(sums**2, axis=(0, 1)) * blocks * runs / (blocks * runs - 1))
+    return np.max(found, axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -17,10 +18,11 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
-from sysid.modal_analysis.poles_of_test import poles_of_test
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.problem.feasibility import points_of
 from sysid.problem.formulation import Formulation
-from sysid.problem.stated import StatedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, most_deviations
@@ -50,18 +52,17 @@ def wrong_records(context: Context) -> Iterator[Finding]:
     if context.outcome is not None:
         yield from context.named
         return
-    problem = context.problem.stated
-    declared = problem.declared
+    problem, declared = context.problem.stated, context.problem.stated.declared
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     for i, test in enumerate(tests, start=1):
-        for mistake in _of_test(problem, declared, test, first=test is problem.measurement):
+        for mistake in _of_test(context.problem, declared, test, first=test is problem.measurement):
             in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
             one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
             yield one if len(tests) == 1 else one.of_test(i)
 
 
-def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
+def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
@@ -74,10 +75,19 @@ def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *
         if first and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:
-            found = list(unresolved(test, *poles_of_test(test)))
+            found = list(unresolved(test, *_rough_poles(test)))
     except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
         return []
     return found
+
+
+def _rough_poles(test: Measurement) -> tuple[Array, Array]:
+    """Poles, rad/s and ratios, (m,) each: those of whole records beside their transients, with rough weights."""
+    if test.whole is not None:
+        test = test.at(decimated_lines(test))
+        test = replace(test, response_std=rough_deviations(test))
+    found = find_poles(test)
+    return found.omega, found.ratios
 
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -121,12 +131,14 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
     return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
 
 
-def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
+def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement) -> Iterator[Finding]:
     """Lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
-    stated = getattr(problem.stiffness, "natural_frequencies", None)
+    stated = getattr(problem.stated.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
         return
-    found = poles_of_test(test)[0] / (2 * np.pi)
+    # The search reads the poles of lines that stand for themselves, and finds them here already.
+    plain = problem.in_squares and all(one.whole is None for one in problem.stated.tests)
+    found = (problem.geometry.poles.omega if plain else _rough_poles(test)[0]) / (2 * np.pi)
     if stated is not None:
         low = high = np.atleast_1d(np.array(stated, dtype=float))
         what = "the stated natural frequencies are"
