@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis import stored_fit
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
@@ -323,5 +322,5 @@ class Prepared:
         """That of the stated problem, with the poles that were found where the same records show them again."""
         given = all(one.records is one.given for one in self.screened.modal)
         poles: Poles | None = vars(self.geometry).get("poles") if given else None
-        fits = [None if one.fit is None else stored_fit.to_tree(one.fit) for one in self.modal]
+        fits = [None if one.fit is None else one.fit.to_tree() for one in self.modal]
         return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles), "fits": fits}

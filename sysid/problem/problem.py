@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis import stored_fit
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
@@ -104,9 +104,10 @@ class Problem(StatedProblem):
             goal=tree["goal"],
             loss=tree["loss"],
         )
-        fits = stored_fit.fits_from_tree(tree, problem.tests)
-        if any(fits):
-            vars(problem)["prepared"] = Prepared(problem, fits=fits)
+        tests = problem.tests
+        fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
+        found = [fit and RecordFit.from_tree(fit, test) for fit, test in zip(fits, tests, strict=True)]
+        vars(problem)["prepared"] = Prepared(problem, fits=found)
         if tree["poles"] is not None:
             problem.prepared.geometry.found = tree["poles"]
         return problem
