@@ -77,6 +77,13 @@ class Prepared:
             geometry.monitor = formulation.monitor = None
         return problem
 
+    @classmethod
+    def from_tree(cls, stated: StatedProblem, tree: dict[str, Any]) -> Prepared:
+        """Make what `to_tree` made a tree of, with the fits of its whole records."""
+        tests = stated.tests
+        fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
+        return cls(stated, fits=[fit and RecordFit.from_tree(fit, test) for fit, test in zip(fits, tests, strict=True)])
+
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""

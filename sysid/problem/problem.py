@@ -9,7 +9,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
@@ -104,10 +103,7 @@ class Problem(StatedProblem):
             goal=tree["goal"],
             loss=tree["loss"],
         )
-        tests = problem.tests
-        fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
-        found = [fit and RecordFit.from_tree(fit, test) for fit, test in zip(fits, tests, strict=True)]
-        vars(problem)["prepared"] = Prepared(problem, fits=found)
+        vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:
             problem.prepared.geometry.found = tree["poles"]
         return problem
