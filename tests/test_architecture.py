@@ -25,8 +25,9 @@ CEILINGS = {
     # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
     # by checks that share one context (600), a page of half the size and time (140),
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530);
-    # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340).
-    "lines": 41_872,
+    # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340),
+    # and fits that end when they are asked to, with the best so far, which results hold (400).
+    "lines": 42_272,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.0,
     "files": 258,

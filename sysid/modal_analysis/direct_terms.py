@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.pole_functions import unit_columns
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.relocation import Blocks, relocate
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
@@ -26,7 +25,7 @@ from sysid.modal_analysis.record_fit import (
 )
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_spurious import without_spurious_modes
@@ -56,7 +55,7 @@ def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> Record
             return _whole_fit(test, monitor)
     except (Stop, KeyboardInterrupt):
         best = monitor.best
-        if best is None:
+        if not isinstance(best, RecordFit):
             raise
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)

@@ -5,14 +5,24 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from sysid.errors import Stop
+from sysid.measurement.measurement import Measurement
 
-if TYPE_CHECKING:
-    from sysid.modal_analysis.record_fit import RecordFit
+
+class Fitted(Protocol):
+    """A fit, as far as it is compared with others: see `sysid.modal_analysis.record_fit.RecordFit`."""
+
+    @property
+    def test(self) -> Measurement:
+        """The test that was fitted."""
+
+    @property
+    def schwarz(self) -> float:
+        """By which fits of the same lines are compared: the larger, the better."""
 
 
 class FitMonitor:
@@ -38,15 +48,15 @@ class FitMonitor:
 
     def __init__(
         self,
-        listener: Callable[[int, float, str], object] | None = None,
-        check: Callable[[bool], object] | None = None,
+        listener: Callable[[int, float, str], object] = lambda iteration, residual, doing: None,
+        check: Callable[[bool], object] = lambda kept: None,
         seconds: float | None = None,
     ) -> None:
         self._listener, self._check = listener, check
         self._end = np.inf if seconds is None else time.perf_counter() + seconds
         self._deadline = self._end
         self._may_end = False
-        self.best: RecordFit | None = None
+        self.best: Fitted | None = None
         self.doing = ""
 
     def begin(self, tests: int) -> None:
@@ -66,27 +76,25 @@ class FitMonitor:
 
     def __call__(self, iteration: int, residual: float) -> None:
         """Tell an iteration, and end the fit where that is wanted."""
-        if self._listener is not None:
-            before, self._may_end = self._may_end, False
-            self._listener(iteration, residual, self.doing)
-            self._may_end = before
+        before, self._may_end = self._may_end, False
+        self._listener(iteration, residual, self.doing)
+        self._may_end = before
         self.check()
 
     def check(self) -> None:
         """End the fit where that is wanted; may be called at any time, from a signal too."""
         if not self._may_end:
             return
-        if self._check is not None:
-            self._check(self.best is not None)
+        self._check(self.best is not None)
         if self.best is not None and time.perf_counter() > self._deadline:
             raise Stop("the time for the modes was over")
 
-    def keep(self, fit: RecordFit) -> None:
+    def keep(self, fit: Fitted) -> None:
         """Keep a fit that was judged, unless that of the same lines that is kept already is better."""
         best = self.best
         if best is None or best.test.freq.size != fit.test.freq.size or fit.schwarz > best.schwarz:
             self.best = fit
 
-    def keep_instead(self, fit: RecordFit) -> None:
+    def keep_instead(self, fit: Fitted) -> None:
         """Keep a fit in the place of another one that was found to be wrong."""
         self.best = fit

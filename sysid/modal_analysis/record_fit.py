@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -138,6 +139,37 @@ class RecordFit:
             root = root[0]
         force = root[..., n : n + d] if self.test.force is not None else None
         return NoiseLevels(root[..., :n], root[..., -d:], force)
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give what was found, without the records, as dictionaries, arrays and numbers; `from_tree` takes it back."""
+        p = self.parameters
+        return {
+            "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
+            "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "varying": self.model.whole.varying,
+        }  # fmt: skip
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any], test: Measurement) -> RecordFit:
+        """Give the fit of a test that `to_tree` made a tree of, exact to the bit.
+
+        Raises
+        ------
+        InputError
+            Where it is of another test.
+        """
+        refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
+        test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
+        p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"])
+        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"])
+        model, m, c = fit.model, p.modes.omega.size, fit.model.channels
+        parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
+        shapes: list[tuple[int, ...]] = [
+            (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
+            (test.n_runs, c, TRACES), (len(model.runs), c + model.d),
+        ]  # fmt: skip
+        sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
+        refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))
+        return fit
 
 
 def record_modes(

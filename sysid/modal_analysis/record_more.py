@@ -24,9 +24,7 @@ _REACH = 15.0  # half-power widths about a candidate, of lines that are looked a
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
-def with_further_modes(
-    fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor | None = None
-) -> RecordFit:
+def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
     """The fit with further modes, one after the other, as long as each is worth more than noise.
 
     Where lines are many, `some` is the test at a few of them, as in `refitted`.
@@ -43,8 +41,7 @@ def with_further_modes(
         if more.likelihood - fit.likelihood < least or np.any(no_modes(more)) or np.min(worth(more)) < least:
             return fit
         fit = more
-        if monitor is not None:
-            monitor.keep(fit)
+        monitor.keep(fit)
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis import stored_fit
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
@@ -73,6 +72,13 @@ class Prepared:
                 _ = formulation.terms
         finally:
             geometry.monitor = formulation.monitor = None
+
+    @classmethod
+    def from_tree(cls, stated: StatedProblem, tree: dict[str, Any]) -> Prepared:
+        """Make what `to_tree` made a tree of, with the fits of its whole records."""
+        tests = stated.tests
+        fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
+        return cls(stated, fits=[fit and RecordFit.from_tree(fit, test) for fit, test in zip(fits, tests, strict=True)])
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
@@ -332,5 +338,5 @@ class Prepared:
         """That of the stated problem, with the poles that were found where the same records show them again."""
         given = all(one.records is one.given for one in self.screened.modal)
         poles: Poles | None = vars(self.geometry).get("poles") if given else None
-        fits = [None if one.record_fit is None else stored_fit.to_tree(one.record_fit) for one in self.modal]
+        fits = [None if one.record_fit is None else one.record_fit.to_tree() for one in self.modal]
         return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles), "fits": fits}

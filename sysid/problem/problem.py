@@ -9,7 +9,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis import stored_fit
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
@@ -104,9 +103,7 @@ class Problem(StatedProblem):
             goal=tree["goal"],
             loss=tree["loss"],
         )
-        fits = stored_fit.fits_from_tree(tree, problem.tests)
-        if any(fits):
-            vars(problem)["prepared"] = Prepared(problem, fits=fits)
+        vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:
             problem.prepared.geometry.found = tree["poles"]
         return problem

@@ -292,17 +292,16 @@ class Identification(Answer):
         """
         instance("problem", problem, Problem)
         _check_records(self.records, problem)
+        tree = self.prepared.to_tree() if self.part is None else self.part.tree
+        prepared = Prepared.from_tree(problem, tree)
         if self.x is not None:
-            _check_unknowns(self, self.x, problem)
+            _check_unknowns(self, self.x, prepared)
         kept = {
             field.name: getattr(self, field.name)
             for field in fields(self)
             if field.init and field.name not in ("problem", "prepared")
         }
-        part = self.part
-        fits = [one.record_fit for one in self.prepared.modal] if part is None else [part.records.fit]
-        fits += [None] * (len(problem.tests) - len(fits))
-        return type(self)(**kept, problem=problem, prepared=Prepared(problem, fits=fits))
+        return type(self)(**kept, problem=problem, prepared=prepared)
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:
@@ -363,7 +362,7 @@ def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> 
             )
 
 
-def _check_unknowns(result: Identification, x: Array, problem: Problem) -> None:
+def _check_unknowns(result: Identification, x: Array, problem: Prepared) -> None:
     """Refuse a problem of other unknowns, or in which they stand for other matrices."""
     given = [(unknown.name, unknown.shape) for unknown in problem.variables]
     fixed = {unknown.name for unknown in problem.formulation.fixed}

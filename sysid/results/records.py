@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis import stored_fit
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.structure.structure import Structure
 
@@ -33,7 +32,7 @@ class StoredRecords:
             tuple(Measurement.from_tree(test) for test in tree["validation"]),
             tree["goal"],
             tree["loss"],
-            None if fits[0] is None else stored_fit.from_tree(fits[0], test),
+            None if fits[0] is None else RecordFit.from_tree(fits[0], test),
         )
 
 

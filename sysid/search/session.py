@@ -207,6 +207,8 @@ class Session:
             self.report("poles", iteration, 0, objective, doing)
         except Stop as stop:
             self.stop_asked = stop
+        except KeyboardInterrupt:  # a callback's own: held like one of the signal
+            self.interrupt.count = max(self.interrupt.count, 1)
         self._check_limits()
 
     def fit_monitor(self, share: float = 0.8) -> FitMonitor:

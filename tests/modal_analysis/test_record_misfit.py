@@ -10,6 +10,7 @@ import scipy.signal
 
 import sysid
 from sysid.modal_analysis.fit import estimate
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
 from sysid.modal_analysis.record_more import with_further_modes
 from sysid.modal_analysis.record_spread import line_blocks, scatter_over_blocks
@@ -60,7 +61,7 @@ def _fitted(base: Array, response: Array, level: float | None = None) -> RecordF
 
 def test_what_modes_miss_of_a_steady_sine_is_no_mode() -> None:
     fit = _fitted(*_records(np.random.default_rng(0), missed=0.05))
-    more = with_further_modes(fit)
+    more = with_further_modes(fit, monitor=FitMonitor())
     assert more.parameters.modes.omega.size > 2
     found = np.sort(without_spurious_modes(more).parameters.modes.omega) / (2 * np.pi)
     assert found == pytest.approx(FREQUENCIES, rel=3e-3)
