@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +53,7 @@ class _Axis(NamedTuple):
     end: float
     log: bool
 
-    def __call__(self, values: Array | float) -> Array:
+    def __call__(self, values: ArrayLike) -> Array:
         """Pixels of values, not beyond the ends; NaN for what a logarithmic axis cannot show."""
         seen, ends = np.asarray(values, float), np.array([self.low, self.high])
         if self.log:
@@ -80,6 +80,17 @@ class _Panel(NamedTuple):
     decades: int
 
 
+class _Line(NamedTuple):
+    """A curve in pixels, (n_freq,), NaN where there is none, interrupted where it jumps by more than `jump`.
+
+    In each column of so many steps the lowest and the highest point are drawn.
+    """
+
+    y: Array
+    jump: float
+    column: int
+
+
 def curve_sheet(name: str, freq: Array, channel: ChannelSpectra, run: int, gaps: ArrayLike = ()) -> str:
     """One channel in one run: magnitude, phase, and what is left of it beside its noise.
 
@@ -87,14 +98,20 @@ def curve_sheet(name: str, freq: Array, channel: ChannelSpectra, run: int, gaps:
     """
     logarithmic = bool(freq[0] > 0 and freq[-1] > 8 * freq[0])
     across = _Axis(freq[0], freq[-1], _LEFT, _WIDTH - _RIGHT, logarithmic)
-    drawn, bottom = [], 0
-    for panel, height in zip(_panels(channel, run), _HEIGHTS, strict=True):
+    panels, ups, bottom = _panels(channel, run), [], 0
+    for panel, height in zip(panels, _HEIGHTS, strict=True):
         top = bottom + _TITLE
         bottom = top + height
-        drawn.append(_drawn(panel, across, _upward(panel, bottom, top), across(freq), gaps))
-    numbers = (
-        f'<text x="{float(across(value)):.1f}" y="{bottom + 14}">{value:g}</text>' for value in across.ticks(_APART)
-    )
+        ups.append(_upward(panel, bottom, top))
+    lines = [line for panel, up in zip(panels, ups, strict=True) for line in _lines(panel, up)]
+    paths = iter(_paths(across(freq), lines, gaps))
+    drawn = [
+        _drawn(panel, across, up, {kind: next(paths) for kind in panel.curves})
+        for panel, up in zip(panels, ups, strict=True)
+    ]
+    ticks = across.ticks(_APART)
+    places = zip(across(ticks).tolist(), ticks, strict=True)
+    numbers = (f'<text x="{x:.1f}" y="{bottom + 14}">{value:g}</text>' for x, value in places)
     drawn.append(f'<g text-anchor="middle">{"".join(numbers)}</g>')
     drawn.append(f'<text x="{_WIDTH - _RIGHT}" y="{bottom + 27}" text-anchor="end">frequency [Hz]</text>')
     image = _svg(f"{name}: measured and identified {channel.words}", _WIDTH, bottom + _BELOW, "".join(drawn))
@@ -186,21 +203,16 @@ def _svg(title: str, width: int, height: int, content: str) -> str:
     )
 
 
-def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -> str:
-    """Title, grid and curves of a panel; `x` is where the frequencies are, `gaps` at which no curve is joined."""
+def _drawn(panel: _Panel, across: _Axis, up: _Axis, paths: dict[str, str]) -> str:
+    """Title, grid and curves of a panel, the curves as `paths`."""
     parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{escaped(panel.title)}</text>']
     ticks = up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]
-    grid = [f"M{across.start} {float(up(value)):.1f}H{across.end}" for value in ticks]
-    grid += [f"M{float(across(value)):.1f} {up.start}V{up.end}" for value in across.ticks(_APART)]
+    at = up(ticks).tolist()
+    grid = [f"M{across.start} {y:.1f}H{across.end}" for y in at]
+    grid += [f"M{x:.1f} {up.start}V{up.end}" for x in across(across.ticks(_APART)).tolist()]
     parts.append(f'<path class="grid" d="{"".join(grid)}"/>')
-    numbers = (f'<text x="{_LEFT - 5}" y="{float(up(value)) + 4:.1f}">{value:g}</text>' for value in ticks)
+    numbers = (f'<text x="{_LEFT - 5}" y="{y + 4:.1f}">{value:g}</text>' for value, y in zip(ticks, at, strict=True))
     parts.append(f'<g text-anchor="end">{"".join(numbers)}</g>')
-    jump = np.inf if panel.decades else abs(up.start - up.end) / 2
-    paths = {}
-    for kind, values in panel.curves.items():
-        seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
-        # Of a difference, which is noise, the least and the largest in four steps are drawn.
-        paths[kind] = _path(x, up(seen), jump, gaps, 4 if kind == "left" else 1)
     drawn = "".join(f'<path class="{kind}" d="{path}"/>' for kind, path in paths.items())
     parts.append(f'<g transform="scale({1 / _FINE:g})">{drawn}</g>')
     if not any(paths.values()):
@@ -230,49 +242,78 @@ def _log_ticks(low: float, high: float, room: float) -> list[float]:
     return [value for value in numbers if low <= value <= high]
 
 
-def _path(x: Array, y: Array, jump: float, gaps: ArrayLike, column: int) -> str:
-    """A curve in whole steps of part of a pixel, `column` to the right, with gaps where it is not finite or jumps."""
-    kept = np.flatnonzero(np.isfinite(y))
-    apart = (np.diff(kept) > 1) | (np.abs(np.diff(y[kept])) > jump) | np.isin(kept[1:], gaps)
-    breaks = np.flatnonzero(apart) + 1
-    return "".join(_segment(x[part], y[part], column) for part in np.split(kept, breaks) if part.size)
+def _lines(panel: _Panel, up: _Axis) -> Iterator[_Line]:
+    """The curves of a panel in pixels."""
+    jump = np.inf if panel.decades else abs(up.start - up.end) / 2
+    for kind, values in panel.curves.items():
+        seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
+        # Of a difference, which is noise, the least and the largest in four steps are drawn.
+        yield _Line(up(seen), jump, 4 if kind == "left" else 1)
 
 
-def _segment(x: Array, y: Array, column: int) -> str:
-    at = _thinned(column * np.rint(_FINE * x / column).astype(int), np.rint(_FINE * y).astype(int))
-    steps = (at[1:] - at[:-1]).ravel().tolist()
-    # a sign separates numbers as a space does
-    return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)).replace(" -", "-") if steps else "h1")
+def _paths(x: Array, lines: Sequence[_Line], gaps: ArrayLike, rounds: int = 3) -> list[str]:
+    """Curves over the same `x` (n_freq,) as paths in steps of part of a pixel, interrupted at `gaps`.
 
-
-def _thinned(x: NDArray[np.intp], y: NDArray[np.intp], rounds: int = 3) -> NDArray[np.intp]:
-    """The lowest and the highest point over each place, (points, 2), without those on the line of their neighbours.
-
-    In each round a curve loses points that it does not need, and stays within a step of where it was.
+    All are thinned at once, as a page has hundreds; in each round they lose points that they do not need, and stay
+    within a step of where they were.
     """
-    starts = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
+    y, jumps, wide = (np.array(part) for part in zip(*lines, strict=True))
+    seen, wide = np.isfinite(y), wide[:, None]
+    first = np.column_stack([
+        np.ones(len(y), bool),
+        ~seen[:, :-1] | (np.abs(np.diff(y)) > jumps[:, None]) | np.isin(np.arange(1, x.size), gaps),
+    ])  # fmt: skip
+    piece = np.cumsum(first).reshape(y.shape)
+    columns = (wide * np.rint(_FINE * x / wide))[seen].astype(int)
+    at, of = _extremes(columns, np.rint(_FINE * y[seen]).astype(int), piece[seen])
+    for kept_of in (_ends_of_levels, *[_bends] * rounds):
+        kept = kept_of(at, of)
+        at, of = at[kept], of[kept]
+    line_of = np.searchsorted(piece[:, -1], of)
+    return _as_paths(at, np.flatnonzero(np.diff(of, prepend=-1)), line_of, len(y))
+
+
+def _extremes(
+    x: NDArray[np.intp], y: NDArray[np.intp], piece: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The lowest and the highest point over each place, in their order, (points, 2), and the pieces they belong to."""
+    if not x.size:
+        return np.zeros((0, 2), int), piece
+    starts = np.flatnonzero((np.diff(x, prepend=-1) != 0) | (np.diff(piece, prepend=-1) != 0))
     low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
     rising = np.abs(y[starts] - low) <= np.abs(y[starts] - high)
-    at = np.empty((2 * starts.size, 2), int)
-    at[::2, 0] = at[1::2, 0] = x[starts]
+    at, of = np.repeat(np.column_stack([x, y])[starts], 2, axis=0), np.repeat(piece[starts], 2)
     at[::2, 1], at[1::2, 1] = np.where(rising, low, high), np.where(rising, high, low)
-    at = at[np.concatenate([[True], (at[1:] != at[:-1]).any(axis=1)])]
-    if len(at) < 3:
-        return at
-    level = (at[1:-1, 1] == at[:-2, 1]) & (at[1:-1, 1] == at[2:, 1])
-    at = at[np.concatenate([[True], ~level, [True]])]
-    for _ in range(rounds):
-        at = at[_bends(at)]
-    return at
+    other = np.concatenate([[True], np.any(np.diff(at, axis=0) != 0, axis=1) | (np.diff(of) != 0)])
+    return at[other], of[other]
 
 
-def _bends(at: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Which points of a curve (points, 2) to keep: all but every other one within a step of the neighbours' line.
+def _ends_of_levels(at: NDArray[np.intp], piece: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Which points of curves (points, 2) to keep: all but those between two that are as high."""
+    kept, level = np.ones(len(at), bool), (np.diff(at[:, 1]) == 0) & (np.diff(piece) == 0)
+    kept[1:-1] = ~(level[1:] & level[:-1])
+    return kept
+
+
+def _bends(at: NDArray[np.intp], piece: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Which points of curves (points, 2) to keep: all but every other one within a step of the neighbours' line.
 
     Peaks stay: the neighbours of a point that is left out are kept.
     """
     kept = np.ones(len(at), bool)
     before, this, after = at[:-2:2], at[1:-1:2], at[2::2]
     (wide, high), (x, y) = (after - before).T, (this - before).T
-    kept[1:-1:2] = np.abs(y * wide - high * x) > wide
+    kept[1:-1:2] = (np.abs(y * wide - high * x) > wide) | (piece[:-2:2] != piece[2::2])
     return kept
+
+
+def _as_paths(at: NDArray[np.intp], starts: NDArray[np.intp], line_of: NDArray[np.intp], count: int) -> list[str]:
+    """The pieces of points (points, 2), each from one of `starts` to the next, joined to the path of their line."""
+    moves, ends = np.diff(at, axis=0).ravel().tolist(), [*starts[1:].tolist(), len(at)]
+    paths = [""] * count
+    for start, end in zip(starts.tolist(), ends, strict=True):
+        steps = moves[2 * start : 2 * end - 2]
+        # a sign separates numbers as a space does
+        drawn = "l" + " ".join(map(str, steps)).replace(" -", "-") if steps else "h1"
+        paths[line_of[start]] += f"M{at[start, 0]} {at[start, 1]}{drawn}"
+    return paths
