@@ -1,0 +1,132 @@
+"""One continuous structure identified from its test, beside the truth and the Cramér-Rao bound.
+
+``python -m benchmarks.band.one_structure NUMBER`` prints the figures as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+import sysid
+from benchmarks.band.cramer_rao import Bound, bound, in_band
+from benchmarks.band.simulated_tests import Draw, draw, transfer
+from benchmarks.band.structures import Continuous, structure
+from benchmarks.mistakes.named_mistakes import MISTAKES
+from benchmarks.modal.identification import error_text
+from benchmarks.records.coupled_records import NEAR, matched
+
+LEVEL = 0.95
+INTERVALS = ("natural_frequencies", "damping_ratios", "effective_masses")
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Outcome of one test.
+
+    Attributes
+    ----------
+    determined : bool
+    open : str
+        What first speaks against it or leaves it open.
+    found : int
+        Modes in the lines; `matched` of them are modes of the structure.
+    accused : list of str
+        Sentences that accuse a right record.
+    ratios : dict of str to list of float
+        Errors in the band over their bounds.
+    held : dict of str to list of bool
+        Which 95 % intervals hold the truth.
+    drive : float
+        Distance of absolute accelerations and forces for unit base motion, over their norm in the lines: the larger.
+    seconds : float
+        Of processor time.
+    """
+
+    determined: bool
+    open: str
+    found: int
+    matched: int
+    accused: list[str]
+    ratios: dict[str, list[float]]
+    held: dict[str, list[bool]]
+    drive: float
+    seconds: float
+
+
+def compared(truth: Continuous, test: Draw, least: Bound) -> Figures:
+    """Identify from the records alone, and compare."""
+    start = time.process_time()
+    result = sysid.identify(sysid.Problem(test.measurement, mass=sysid.FullMass()), rng=0)
+    seconds = time.process_time() - start
+    found = result.structure
+    inside = np.flatnonzero(found.natural_frequencies <= truth.lines[1])
+    f = least.values["natural_frequencies"]
+    half_width = least.values["damping_ratios"] * f
+    near = np.maximum(NEAR[0] * least.std["natural_frequencies"], NEAR[1] * half_width)
+    pairs = matched(f, found.natural_frequencies[inside], near)
+    accused = [it for it in result.contradictions if it.channel is not None or it.kind in MISTAKES]
+    first = next(
+        (f"{it.kind}: {it.sentence}" for it in result.findings if it.severity in ("contradicts", "caution")), ""
+    )
+    all_there = len(pairs) == len(inside) == truth.count
+    mine = inside[[j for _, j in pairs]] if all_there else inside[:0]
+    return Figures(
+        result.determined, first, len(inside), len(pairs), [f"{it.kind}: {it.sentence}" for it in accused],
+        _ratios(found, least, mine) if all_there else {}, _held(result, least, mine) if all_there else {},
+        _drive(found, truth, test), seconds,
+    )  # fmt: skip
+
+
+def _ratios(found: sysid.Structure, least: Bound, mine: np.ndarray) -> dict[str, list[float]]:
+    """Errors over bounds, of entries of matrices once; `mine` are the modes in the lines."""
+    values = in_band(
+        2 * np.pi * found.natural_frequencies[mine], found.damping_ratios[mine], found.participation[mine],
+        found.mode_shapes[np.ix_(least.dofs, mine)],
+    )  # fmt: skip
+    return {name: (_once(values[name] - least.values[name]) / _once(std)).tolist() for name, std in least.std.items()}
+
+
+def _held(result: sysid.Identification, least: Bound, mine: np.ndarray) -> dict[str, list[bool]]:
+    held = {}
+    for name in INTERVALS:
+        low, high = (_once(end[mine]) for end in result.uncertainty.interval(name, level=LEVEL))
+        exact = _once(least.values[name])
+        told = np.isfinite(low)
+        held[name] = ((low <= exact) & (exact <= high))[told].tolist()
+    return held
+
+
+def _once(values: np.ndarray) -> np.ndarray:
+    """Values of modes as they are, of symmetric matrices each entry once."""
+    if values.ndim == 1:
+        return values
+    return values[..., *np.tril_indices(values.shape[-1])].ravel()
+
+
+def _drive(found: sysid.Structure, truth: Continuous, test: Draw) -> float:
+    freq = test.omega / (2 * np.pi)
+    H, Z = transfer(truth.modes, test.omega)
+    mine = found.relative_acceleration(freq) + truth.modes.rigid_body[..., None]
+    pairs = ((mine, H), (found.base_force(freq), Z))
+    return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
+
+
+def main() -> None:
+    """Run one, and print its figures, those of the bound with them."""
+    truth = structure(int(sys.argv[1]))
+    test = draw(truth)
+    least = bound(truth, test)
+    try:
+        figures = asdict(compared(truth, test, least))
+    except Exception as error:  # a crash is an answer too: the line counts it as not met
+        figures = {"said": error_text(error)}
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
