@@ -1,4 +1,4 @@
-"""Rough weights of whole records: noise of the base makes errors largest at the peaks.
+"""Rough weights of whole records, and poles by these: noise of the base makes errors largest at the peaks.
 
 Weights need no modes: the motion of a sensor over that of the base, smoothed over some lines, is what passes the noise
 of the base on.
@@ -6,10 +6,13 @@ of the base on.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array
 
 
@@ -47,3 +50,18 @@ def _smooth(power: Array, width: int = 5) -> Array:
     count = np.convolve(np.ones(power.shape[-1]), kernel, mode="same")
     flat = power.reshape(-1, power.shape[-1])
     return np.array([np.convolve(row, kernel, mode="same") / count for row in flat]).reshape(power.shape)
+
+
+def poles_of_test(test: Measurement) -> tuple[Array, Array]:
+    """Poles of a test of any kind, rad/s and ratios, (m,) each: of whole records roughly, beside their transients.
+
+    Raises
+    ------
+    InputError
+        As `find_poles` does.
+    """
+    if test.is_whole:
+        test = test.at(decimated_lines(test))
+        test = replace(test, response_std=rough_deviations(test))
+    found = find_poles(test)
+    return found.omega, found.ratios
