@@ -1,4 +1,4 @@
-"""Lines of whole records before any fit: which tell the modes, whether they do, and rough weights.
+"""Lines of whole records before any fit: which tell the modes, whether they do, rough weights, and poles by these.
 
 Noise of the base makes errors largest at the peaks. Weights need no modes: the motion of a sensor over that of the
 base, smoothed over some lines, is what passes the noise of the base on.
@@ -6,10 +6,13 @@ base, smoothed over some lines, is what passes the noise of the base on.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array
 
 
@@ -69,3 +72,18 @@ def steady_sine(test: Measurement, beside: int = 3, share: float = 0.9, few: flo
         "response at these frequencies alone, and neither modes nor damping; record from before the motion begins "
         "until it has died away, or move the base at all frequencies of interest (random motion, sweep, stepped sines)"
     )
+
+
+def poles_of_test(test: Measurement) -> tuple[Array, Array]:
+    """Poles of a test of any kind, rad/s and ratios, (m,) each: of whole records roughly, beside their transients.
+
+    Raises
+    ------
+    InputError
+        As `find_poles` does.
+    """
+    if test.is_whole:
+        test = test.at(decimated_lines(test))
+        test = replace(test, response_std=rough_deviations(test))
+    found = find_poles(test)
+    return found.omega, found.ratios

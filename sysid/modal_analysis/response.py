@@ -160,28 +160,29 @@ def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
 
     Lines weigh by what is stated of the force's noise.
     """
-    return _weighed(test, omega, ratios)[0]
+    _, _, found = _weighed(test, omega, ratios)
+    return found[: test.n_base].T
 
 
 def weighed_mass_std(test: Measurement, omega: Array, ratios: Array) -> Array:
     """Standard deviation of the diagonal of `weighed_mass`, (d,), by what the fit leaves of the force."""
-    return _weighed(test, omega, ratios)[1]
+    design, force, found = _weighed(test, omega, ratios)
+    left = np.sum((force - design @ found) ** 2, axis=0) / max(len(design) - design.shape[1], 1)
+    size = np.linalg.norm(design, axis=0)
+    size[size == 0] = 1.0
+    d = test.n_base
+    return np.sqrt(left) * np.linalg.norm(np.linalg.pinv(design / size), axis=1)[:d] / size[:d]
 
 
-def _weighed(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, Array]:
-    """Rigid-body mass (d, d), and the standard deviation of its diagonal, (d,)."""
+def _weighed(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, Array, Array]:
+    """Motion of the base and of the modes as columns, the force likewise, and how much of each makes up the force."""
     assert test.force is not None
-    d, weight = test.n_base, separable(test.force_std, test.force.shape)[1].ravel()
+    weight = separable(test.force_std, test.force.shape)[1].ravel()
     u = columns(test.base)
     modal = np.tile(gains(test.freq, omega, ratios), test.n_runs)[:, None] * u
     design = stacked(weight * np.concatenate([u, modal.reshape(-1, u.shape[1])]))
     force = stacked(weight * columns(test.force))
-    found = np.linalg.lstsq(design, force, rcond=None)[0]
-    left = np.sum((force - design @ found) ** 2, axis=0) / max(len(design) - design.shape[1], 1)
-    size = np.linalg.norm(design, axis=0)
-    size[size == 0] = 1.0
-    spread = np.linalg.norm(np.linalg.pinv(design / size), axis=1)[:d] / size[:d]
-    return found[:d].T, np.sqrt(left) * spread
+    return design, force, np.linalg.lstsq(design, force, rcond=None)[0]
 
 
 def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,8 +17,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
-from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.modal_analysis.record_poles import poles_of_test
 from sysid.problem.feasibility import points_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
@@ -75,19 +73,10 @@ def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, fir
         if first and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:
-            found = list(unresolved(test, *_rough_poles(test)))
+            found = list(unresolved(test, *poles_of_test(test)))
     except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
         return []
     return found
-
-
-def _rough_poles(test: Measurement) -> tuple[Array, Array]:
-    """Poles, rad/s and ratios, (m,) each: those of whole records beside their transients, with rough weights."""
-    if test.whole is not None:
-        test = test.at(decimated_lines(test))
-        test = replace(test, response_std=rough_deviations(test))
-    found = find_poles(test)
-    return found.omega, found.ratios
 
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -137,8 +126,8 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
     if declared.stiffness.free and stated is None:
         return
     # The search reads the poles of lines that stand for themselves, and finds them here already.
-    plain = problem.in_squares and all(one.whole is None for one in problem.stated.tests)
-    found = (problem.geometry.poles.omega if plain else _rough_poles(test)[0]) / (2 * np.pi)
+    plain = problem.in_squares and not any(one.is_whole for one in problem.stated.tests)
+    found = (problem.geometry.poles.omega if plain else poles_of_test(test)[0]) / (2 * np.pi)
     if stated is not None:
         low = high = np.atleast_1d(np.array(stated, dtype=float))
         what = "the stated natural frequencies are"

@@ -1,0 +1,84 @@
+"""Modes of spectra as a modal estimate: exact where the records are, and said to be lacking where these fix none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
+from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.nlp import IterationMonitor
+
+
+def fitted(test: sysid.Measurement, count: int | None = None) -> ModalEstimate:
+    """The estimate with the modes of its lines."""
+    return fit_modes_of_lines(
+        ModalEstimate.of_lines(test), find_poles(test), np.ones(test.n_base), count=count,
+        monitor=IterationMonitor(None, None), max_iterations=100,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_modes_of_exact_spectra_are_those_of_the_structure(force):
+    truth = random_structure(11, n=5, d=2)
+    modal = fitted(sysid.simulate(truth, frequency_lines(truth), force=force))
+    np.testing.assert_allclose(modal.omega / (2 * np.pi), truth.natural_frequencies, rtol=1e-7)
+    np.testing.assert_allclose(modal.ratios, truth.damping_ratios, rtol=1e-6)
+    residues, expected = (
+        np.einsum("nk,kd->knd", shapes, pushes)
+        for shapes, pushes in ((modal.phi, modal.gamma), (truth.mode_shapes, truth.participation))
+    )
+    np.testing.assert_allclose(residues, expected, atol=1e-6 * np.abs(expected).max())
+    if force:
+        np.testing.assert_allclose(modal.gamma.T @ modal.gamma, truth.participation.T @ truth.participation, rtol=1e-5)
+        size = np.abs(truth.rigid_body_mass).max()
+        np.testing.assert_allclose(modal.rigid, truth.rigid_body_mass, atol=1e-6 * size)
+    assert not modal.by_modes and modal.fit is not None and not modal.lacking
+
+
+def test_fewer_modes_are_those_that_the_records_feel_most():
+    truth = random_structure(11, n=5, d=2)
+    test = sysid.simulate(truth, frequency_lines(truth), noise=0.01, rng=3)
+    modal = fitted(test, 2)
+    gaps = np.abs(modal.omega[:, None] / (2 * np.pi) / truth.natural_frequencies - 1).min(axis=1)
+    assert modal.omega.size == 2 and np.all(gaps < 0.05)
+    with pytest.raises(sysid.InputError):
+        fitted(test, 9)
+
+
+def test_a_base_that_moves_in_too_few_directions_is_told_and_fixes_no_modes():
+    truth = random_structure(11, n=5, d=2)
+    test = sysid.simulate(truth, frequency_lines(truth))
+    alike = replace(test, base=np.repeat(test.base[:1], 2, axis=0), response=np.repeat(test.response[:1], 2, axis=0))
+    modal = fitted(alike)
+    assert modal.lacking and modal.omega.size == 0 and modal.fit is None
+
+
+def test_the_modes_of_spectra_stand_in_the_result_and_are_those_of_its_structure_where_nothing_else_is_stated():
+    truth = random_structure(12, n=4, d=1)
+    test = sysid.simulate(truth, frequency_lines(truth), force=True, noise=0.005, rng=1)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    deviation = result.uncertainty.natural_frequencies
+    found = result.modal[0].omega / (2 * np.pi)
+    assert np.all(np.abs(found - result.structure.natural_frequencies) < 0.01 * deviation)
+
+
+def test_a_written_model_fits_no_modes_and_looks_for_poles_once(monkeypatch):
+    """A check of units before the search, and the box of the damping ratios, read the same poles."""
+    from sysid.modal_analysis import vector_fitting
+
+    calls, find = [], vector_fitting._find
+    monkeypatch.setattr(vector_fitting, "_find", lambda *args: calls.append(1) or find(*args))
+    m, k = np.array([2.0, 1.0]), np.array([3e3, 2e3])
+    K = np.array([[k.sum(), -k[1], -k[0]], [-k[1], k[1], 0.0], [-k[0], 0.0, k[0]]])
+    truth = sysid.Structure(np.diag([*m, 0.0]), K, [0.02, 0.02], n_base=1)
+    test = sysid.simulate(truth, frequency_lines(truth, 200), force=True, noise=0.005, rng=1)
+    problem = sysid.Problem(test, mass=sysid.LumpedMass(), stiffness=sysid.ChainStiffness(1e2, 1e5))
+    result = sysid.identify(problem, rng=0)
+    assert result.success and result.modal[0].omega.size == 0
+    assert len(calls) == 1
