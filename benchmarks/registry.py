@@ -100,6 +100,7 @@ BENCHMARKS = (
     Benchmark("records.two_runs", "errors of two unequal runs over those of one", "3 min", "20 s"),
     Benchmark("records.record_speed", "seconds and memory from records in time to a judged result", "1 min", "10 s"),
     Benchmark("records.measured_records", "measured records: stated deviations against a jackknife", "1 min", "30 s"),
+    Benchmark("records.stopped_fits", "fits stopped by Ctrl-C and --max-time: nothing lost, in time", "8 min", "40 s"),
     Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "3 min", "10 s"),
     Benchmark(
         "files.read_files", "one test as CSV, MAT, UFF 58 and 58b: masses after read, run and export", "40 s", "12 s"
