@@ -10,12 +10,23 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.excitation import steady_sine
+from sysid.modal_analysis.excitation import at_sines_alone, steady_sine
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    WHOLE,
+    Limits,
+    Monitor,
+    RecordFit,
+    joint_worth,
+    on_all_lines,
+    record_modes,
+    refitted,
+    without,
+)
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
+from sysid.modal_analysis.record_more import PROMISING, least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
@@ -35,13 +46,15 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     InputError
         As `find_poles` does, or where the base moved in a steady sine.
     """
+    sentence = steady_sine(test)
     try:
         fit = _white_fit(test, monitor)
     except (InputError, np.linalg.LinAlgError) as error:
-        sentence = steady_sine(test)
         if sentence is None:
             raise
         raise InputError(sentence) from error
+    if sentence is not None and (not fit.settled or at_sines_alone(test, fit.parameters.modes.omega)):
+        raise InputError(sentence)
     fit = with_varying_levels(fit, monitor=monitor)
     if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
         fit = _pruned(fit, monitor)
@@ -70,14 +83,21 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
 def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordFit:
     """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
     first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
-    fit = _kept(first, monitor)
+    fit = _kept(_pruned(first, monitor, limits=ROUGH), monitor)
     repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
-    modes = repeated.parameters.modes.omega.size
-    if modes == first.parameters.modes.omega.size:
+    if repeated.model.m == first.model.m:
+        return fit
+    repeated = _pruned(repeated, monitor, limits=ROUGH)
+    if not _worth_more(repeated, fit, PROMISING):
         return fit
     repeated = _kept(repeated, monitor)
-    more = repeated.parameters.modes.omega.size - fit.parameters.modes.omega.size
-    return repeated if repeated.likelihood - fit.likelihood > max(more, 0) * least_worth(fit.model) else fit
+    return repeated if _worth_more(repeated, fit) else fit
+
+
+def _worth_more(fit: RecordFit, other: RecordFit, share: float = 1.0) -> bool:
+    """True where a fit explains more than another by a share of what its further modes must be worth."""
+    more = max(fit.model.m - other.model.m, 0)
+    return fit.likelihood - other.likelihood > share * more * least_worth(other.model)
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
@@ -89,28 +109,29 @@ def _same_modes(modes: Modes, poles: Poles) -> bool:
 
 
 def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
-    """A rough fit without modes that noise explains, settled, and without those that it explains then."""
-    for rough in (True, False):
-        if not rough:
-            fit = refitted(fit, fit.parameters, monitor=monitor)
-        fit = _pruned(fit, monitor, rough=rough)
+    """A rough fit settled, and without the modes that noise explains then."""
+    return _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
+
+
+def _pruned(fit: RecordFit, monitor: Monitor | None, *, limits: Limits = WHOLE) -> RecordFit:
+    """The fit without modes that noise explains, several together where noise explains them all."""
+    while np.any(least := _least(fit)):
+        fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
     return fit
 
 
-def _pruned(fit: RecordFit, monitor: Monitor | None, *, rough: bool = False) -> RecordFit:
-    """The fit without modes that noise explains, one after the other."""
-    while (least := _least(fit)) is not None:
-        fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
-    return fit
-
-
-def _least(fit: RecordFit) -> int | None:
-    """The mode that explains least, if no more than noise."""
-    if fit.parameters.modes.omega.size == 1:
-        return None
-    value = np.where(no_modes(fit), 0.0, worth(fit))
-    least = int(np.argmin(value))
-    return least if value[least] < least_worth(fit.model) else None
+def _least(fit: RecordFit) -> NDArray[np.bool_]:
+    """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
+    rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
+    value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
+    first, *others = np.argsort(value, kind="stable")
+    gone = (np.arange(m) == first) & (value < least) & (m > 1)
+    for k in others[:-1]:
+        more = gone | (np.arange(m) == k)
+        if value[k] >= least or rise(more) >= least:
+            break
+        gone = more
+    return gone
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

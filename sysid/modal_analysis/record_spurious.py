@@ -21,7 +21,7 @@ _MORE = 4.0  # times what a mode must be worth where noise alone is left
 def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
     """The fit without spurious modes, one after the other; as it is where what is left is white noise."""
     first = fit
-    while (least := _spurious(fit)) is not None:
+    while np.any(least := _spurious(fit)):
         # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes
         fit = record_modes(fit.test, modes.omega, modes.ratios, monitor=monitor)
@@ -30,13 +30,13 @@ def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) ->
     return without_spurious_modes(refitted(fit, fit.parameters, monitor=monitor), monitor=monitor)
 
 
-def _spurious(fit: RecordFit) -> int | None:
-    """The mode that is worth least beyond what the model misses, if too little."""
-    if fit.parameters.modes.omega.size == 1 or not uneven(fit):
-        return None
+def _spurious(fit: RecordFit) -> NDArray[np.bool_]:
+    """The mode that is worth least beyond what the model misses, if too little, (m,)."""
+    m = fit.parameters.modes.omega.size
+    if m == 1 or not uneven(fit):
+        return np.zeros(m, bool)
     value = worth_beyond_misfit(fit)
-    least = int(np.argmin(value))
-    return least if value[least] < _MORE * least_worth(fit.model) else None
+    return (np.arange(m) == np.argmin(value)) & (value < _MORE * least_worth(fit.model))
 
 
 def worth_beyond_misfit(fit: RecordFit) -> Array:
