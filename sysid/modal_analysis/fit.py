@@ -15,17 +15,20 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    WHOLE,
+    Limits,
     RecordFit,
     at_all_lines,
+    joint_worth,
     on_all_lines,
     record_modes,
     refitted,
     without,
-    worth,
 )
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
+from sysid.modal_analysis.record_more import PROMISING, least_worth, no_modes, with_further_modes
+from sysid.modal_analysis.record_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_spurious import without_spurious_modes
@@ -62,13 +65,15 @@ def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> Record
 
 
 def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+    sentence = steady_sine(test)
     try:
         fit = _white_fit(test, monitor)
     except (InputError, np.linalg.LinAlgError) as error:
-        sentence = steady_sine(test)
         if sentence is None:
             raise
         raise InputError(sentence) from error
+    if sentence is not None and (not fit.settled or at_sines_alone(test, fit.parameters.modes.omega)):
+        raise InputError(sentence)
     monitor.doing = "levels of noise that vary"
     fit = with_varying_levels(fit, monitor=monitor)
     if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
@@ -114,19 +119,26 @@ def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
     """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
     monitor.doing = f"{poles.omega.size} modes"
     first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
-    fit = _kept(first, monitor)
+    fit = _kept(_pruned(first, monitor, limits=ROUGH), monitor)
     monitor.keep(fit)
     monitor.doing = "several modes at a pole"
     repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
-    modes = repeated.parameters.modes.omega.size
-    if modes == first.parameters.modes.omega.size:
+    if repeated.model.m == first.model.m:
+        return fit
+    repeated = _pruned(repeated, monitor, limits=ROUGH)
+    if not _worth_more(repeated, fit, PROMISING):
         return fit
     repeated = _kept(repeated, monitor)
-    more = repeated.parameters.modes.omega.size - fit.parameters.modes.omega.size
-    if repeated.likelihood - fit.likelihood <= max(more, 0) * least_worth(fit.model):
+    if not _worth_more(repeated, fit):
         return fit
     monitor.keep(repeated)
     return repeated
+
+
+def _worth_more(fit: RecordFit, other: RecordFit, share: float = 1.0) -> bool:
+    """True where a fit explains more than another by a share of what its further modes must be worth."""
+    more = max(fit.model.m - other.model.m, 0)
+    return fit.likelihood - other.likelihood > share * more * least_worth(other.model)
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
@@ -137,29 +149,30 @@ def _same_modes(modes: Modes, poles: Poles) -> bool:
     return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
 
 
-def _kept(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
-    """A rough fit without modes that noise explains, settled, and without those that it explains then."""
-    for rough in (True, False):
-        if not rough:
-            fit = refitted(fit, fit.parameters, monitor=monitor)
-        fit = _pruned(fit, monitor, rough=rough)
+def _kept(fit: RecordFit, monitor: FitMonitor | None) -> RecordFit:
+    """A rough fit settled, and without the modes that noise explains then."""
+    return _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
+
+
+def _pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
+    """The fit without modes that noise explains, several together where noise explains them all."""
+    while np.any(least := _least(fit)):
+        fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
     return fit
 
 
-def _pruned(fit: RecordFit, monitor: FitMonitor, *, rough: bool = False) -> RecordFit:
-    """The fit without modes that noise explains, one after the other."""
-    while (least := _least(fit)) is not None:
-        fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
-    return fit
-
-
-def _least(fit: RecordFit) -> int | None:
-    """The mode that explains least, if no more than noise."""
-    if fit.parameters.modes.omega.size == 1:
-        return None
-    value = np.where(no_modes(fit), 0.0, worth(fit))
-    least = int(np.argmin(value))
-    return least if value[least] < least_worth(fit.model) else None
+def _least(fit: RecordFit) -> NDArray[np.bool_]:
+    """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
+    rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
+    value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
+    first, *others = np.argsort(value, kind="stable")
+    gone = (np.arange(m) == first) & (value < least) & (m > 1)
+    for k in others[:-1]:
+        more = gone | (np.arange(m) == k)
+        if value[k] >= least or rise(more) >= least:
+            break
+        gone = more
+    return gone
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

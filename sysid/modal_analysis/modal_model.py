@@ -161,36 +161,13 @@ class Lines:
         variances, c = levels[self.run.piece] * self.run.density, self.model.channels
         return 1 / np.sqrt(variances[:c]), np.sqrt(variances[c:])
 
-    def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
-        """Noise of the base in units of the outputs' own, and its factor.
-
-        With ``B = D H sqrt(v_u)``, D the inverse deviations of the outputs, and ``L L' = I + B' B``: ``B L'^-1``
-        (d, c, L) and L (d, d, L), a line of vectors at a time as d is at most a few.
-        """
-        scale, root = self.deviations(levels)
-        B = np.asarray(scale[:, None] * self.H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
-        d = len(B)
-        factor = np.zeros((d, d, B.shape[2]), dtype=complex)
-        for j in range(d):
-            for i in range(j + 1):
-                product = np.sum(B[j].conj() * B[i], axis=0) + (i == j)  # of the rows of B' B + I
-                for k in range(i):
-                    product -= factor[j, k] * factor[i, k].conj()
-                # Never less than one on the diagonal, round-off aside.
-                factor[j, i] = np.sqrt(np.maximum(product.real, 1.0)) if i == j else product / factor[i, i].real
-        for j in range(d):
-            for i in range(j):
-                B[j] -= B[i] * factor[j, i].conj()
-            B[j] /= factor[j, j].real
-        return B, factor
-
     def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
         """Errors, or other spectra (c, L), weighed by their full covariance."""
         scale, root = self.deviations(levels)
         if not np.any(root):
             e = scale[:, None] * (self.error if error is None else error)
             return Weighed(scale[:, None] * e, _power(e), self.run.base)
-        V, factor = self._base_noise(levels)
+        V, factor = base_noise(self.H, scale, root)
         e = scale[:, None] * (self.error if error is None else error)
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
         noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
@@ -205,21 +182,15 @@ class Lines:
 
     def covered(self, levels: Array) -> ComplexArray:
         """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
-        V = self._base_noise(levels)[0]
-        V *= self.deviations(levels)[0][:, None]
-        return V
+        scale, root = self.deviations(levels)
+        return scale[:, None] * base_noise(self.H, scale, root)[0]
 
-    def weighed_errors(self, levels: Array) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray]:
-        """Lines (L,), rad/s, likeliest inputs (d + 2 r, L), ``S^-1 e`` (c, L) and ``S^-1`` (c, c, L)."""
-        weighed, V = self.weighed(levels), self.covered(levels)
-        inverse = -np.einsum("jcl,jel->cel", V, V.conj())
-        c = np.arange(self.model.channels)
-        inverse[c, c] += self.deviations(levels)[0][:, None] ** 2
-        base = weighed.base
+    def inputs(self, base: ComplexArray) -> ComplexArray:
+        """Likeliest motion of the base and loads by the motion at the ends of all runs, (d + 2 r, L)."""
         ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
         if self.at_ends is not None:
             ends[self.at_ends] = self.transients
-        return self.run.w, np.concatenate([base, ends]), weighed.whitened_residual, inverse
+        return np.concatenate([base, ends])
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """Spectra of which all columns of the Jacobian are made, (spectra, L)."""
@@ -235,6 +206,30 @@ class Lines:
         if self.model.gains:
             parts.append((freq / self.model.test.freq[-1]) ** 2 * base)
         return np.concatenate(parts)
+
+
+def base_noise(H: ComplexArray, scale: Array, root: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Noise of the base in units of the outputs' own, and its factor.
+
+    With ``B = D H sqrt(v_u)``, D the inverse deviations `scale` of the outputs (c,) and `root` the deviations of the
+    base (d,), and ``L L' = I + B' B``: ``B L'^-1`` (d, c, L) and L (d, d, L), a line of vectors at a time as d is at
+    most a few. Then ``S^-1 = D (I - V V') D``.
+    """
+    B = np.asarray(scale[:, None] * H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
+    d = len(B)
+    factor = np.zeros((d, d, B.shape[2]), dtype=complex)
+    for j in range(d):
+        for i in range(j + 1):
+            product = np.sum(B[j].conj() * B[i], axis=0) + (i == j)  # of the rows of B' B + I
+            for k in range(i):
+                product -= factor[j, k] * factor[i, k].conj()
+            # Never less than one on the diagonal, round-off aside.
+            factor[j, i] = np.sqrt(np.maximum(product.real, 1.0)) if i == j else product / factor[i, i].real
+    for j in range(d):
+        for i in range(j):
+            B[j] -= B[i] * factor[j, i].conj()
+        B[j] /= factor[j, j].real
+    return B, factor
 
 
 def _power(rows: ComplexArray) -> Array:

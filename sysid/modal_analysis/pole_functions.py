@@ -42,19 +42,19 @@ class PoleFunctions(NamedTuple):
     own: Sequence[OfRun] = ()
 
     @property
-    def count(self) -> int:
+    def per_pole(self) -> int:
         """Inputs of a pole."""
         return self.inputs.size + sum(one.inputs.size for one in self.own)
 
     @property
     def size(self) -> int:
         """Number of columns."""
-        return self.shared.shape[1] // self.inputs.size * self.count
+        return self.shared.shape[1] // self.inputs.size * self.per_pole
 
     @property
     def places(self) -> list[NDArray[np.intp]]:
         """Where the columns of each run, and last the shared ones, stand pole by pole with all inputs in order."""
-        starts = np.arange(0, self.size, self.count)[:, None]
+        starts = np.arange(0, self.size, self.per_pole)[:, None]
         return [(starts + inputs).ravel() for inputs in (*(one.inputs for one in self.own), self.inputs)]
 
     def in_order(self, parts: Sequence[Array]) -> Array:
@@ -78,7 +78,7 @@ class PoleFunctions(NamedTuple):
 class Basis(NamedTuple):
     """Orthonormal columns: those of each run (rows, columns), then those of all, (rows, k)."""
 
-    own: list[tuple[NDArray[np.intp], Array]]
+    own: Sequence[tuple[NDArray[np.intp], Array]]
     shared: Array
 
     def answers(self, data: Array) -> Array:
@@ -124,8 +124,8 @@ class Beside(NamedTuple):
 
     functions: PoleFunctions
     shared: Array
-    own: list[tuple[NDArray[np.intp], Array]]
-    mixed: list[Array]
+    own: Sequence[tuple[NDArray[np.intp], Array]]
+    mixed: Sequence[Array]
 
     def gram(self) -> Array:
         """Products of all columns with one another, pole by pole."""

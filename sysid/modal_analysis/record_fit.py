@@ -7,11 +7,13 @@ estimated in turn with the fit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
@@ -27,7 +29,9 @@ from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
+_LEAST_SEEN = 1e-10  # of the diagonal of a normal matrix, that is added to what does not show
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
+_SAME_MATRIX = 0.2  # change of modes and levels, relative, within which a normal matrix serves
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
 
@@ -38,7 +42,7 @@ class Limits(NamedTuple):
     steps: int
 
 
-_WHOLE, _ROUGH, _POLES = Limits(12, 60), Limits(3, 4), Limits(1, 20)
+WHOLE, TRIAL, ROUGH, _POLES = Limits(12, 60), Limits(12, 8), Limits(3, 4), Limits(1, 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,25 +194,24 @@ def record_modes(
     """
     first = _first(test, omega, ratios, repeated=repeated)
     model = RecordModel(test, first.modes.omega.size)
-    return _fit(model, first, None, monitor or FitMonitor(), _ROUGH)
+    return _fit(model, first, None, monitor or FitMonitor(), ROUGH)
 
 
 def refitted(
     fit: RecordFit,
     p: Parameters,
     *,
-    rough: bool = False,
+    limits: Limits = WHOLE,
     some: Measurement | None = None,
     monitor: FitMonitor | None = None,
 ) -> RecordFit:
-    """The fit from other parameters, and from its levels of noise; with `rough` a few steps of it.
+    """The fit from other parameters, and from its levels of noise, within limits: of `ROUGH` it takes a few steps.
 
     Where lines are many, `some` is the test at a few of them, which give the normal matrix of each step. Gradients and
     what is left are those of all lines, so that the end is theirs.
     """
     m = p.modes.omega.size
     coarse = None if some is None else RecordModel(some, m).weighed_as_all()
-    limits = _ROUGH if rough else _WHOLE
     return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or FitMonitor(), limits, coarse)
 
 
@@ -251,9 +254,9 @@ def _fit(
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = _rough_levels(model, p)
-    settled, chi2 = False, np.inf
+    settled, chi2, equations = False, np.inf, _Equations(model, coarse)
     for round_ in range(limits.rounds):
-        p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), coarse)
+        p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), equations)
         if stated is not None:
             settled = done
             break
@@ -272,7 +275,7 @@ def _minimise(
     levels: Array,
     monitor: FitMonitor,
     counts: tuple[int, int],
-    coarse: RecordModel | None,
+    equations: _Equations,
 ) -> tuple[Parameters, float, bool]:
     """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most."""
     done, most = counts
@@ -283,16 +286,51 @@ def _minimise(
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: _chi2(model, trial, levels),
-        lambda at: _equations(model, coarse, at, levels),
+        lambda at: equations(at, levels),
     )  # fmt: skip
     return minimise(problem, tell, most, lambda _: _SETTLED)
 
 
-def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, levels: Array) -> NormalEquations:
-    """Normal equations, their matrix from a coarser model where there is one."""
-    if coarse is None:
-        return model.normal_equations(p, levels)
-    return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
+class _Equations:
+    """Normal equations of one fit; their matrix is kept as long as parameters and levels hardly move.
+
+    Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time.
+    """
+
+    def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
+        self.model, self.of_matrix = model, coarse or model
+        self.at: tuple[Parameters, Array] | None = None
+        self.normal: Array = np.zeros((0, 0))
+
+    def __call__(self, p: Parameters, levels: Array) -> NormalEquations:
+        """At these parameters and levels; the matrix from a coarser model where there is one."""
+        if self.at is not None and _moved(self.at[0].modes, p.modes) + _largest(levels / self.at[1]) < _SAME_MATRIX:
+            return self.model.gradient(p, levels)._replace(normal=self.normal)
+        equations = self.of_matrix.normal_equations(p, levels)
+        self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
+        if self.of_matrix is not self.model:
+            equations = self.model.gradient(p, levels)
+        return equations._replace(normal=self.normal)
+
+
+def _moved(modes: Modes, other: Modes) -> float:
+    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape."""
+    turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
+    pole = np.abs(np.log(other.omega / modes.omega)) / modes.ratios
+    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios)))
+
+
+def _largest(ratios: Array) -> float:
+    """Largest change by a ratio."""
+    return float(np.abs(np.log(ratios)).max())
+
+
+def _without_scale(normal: Array, scales: Array) -> Array:
+    """A normal matrix (p, p) that holds moves along `scales` (k, p), which change nothing, at zero."""
+    unit = units_of(normal)
+    rows = np.divide(scales, unit, out=np.zeros_like(scales), where=unit > 0)
+    rows = np.divide(rows / np.linalg.norm(rows, axis=1, keepdims=True), unit, out=np.zeros_like(rows), where=unit > 0)
+    return normal + rows.T @ rows
 
 
 def unit_diagonal(normal: Array) -> tuple[Array, Array]:
@@ -355,10 +393,9 @@ def _rough_levels(model: RecordModel, p: Parameters) -> Array:
     return np.maximum(left / lines, floors(model))
 
 
-def without(fit: RecordFit, k: int) -> Parameters:
-    """Parameters of a fit without mode k."""
-    p = fit.parameters
-    keep = np.arange(p.modes.omega.size) != k
+def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
+    """Parameters of a fit without some modes, (m,)."""
+    p, keep = fit.parameters, ~gone
     modes = Modes(p.modes.phi[:, keep], p.modes.gamma[keep], p.modes.omega[keep], p.modes.ratios[keep])
     return replace(p, modes=modes, ends=p.ends[keep])
 
@@ -368,23 +405,28 @@ def worth(fit: RecordFit, normal: Array | None = None) -> Array:
 
     With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
     """
-    model, p, N = fit.model, fit.parameters, fit.normal if normal is None else normal
-    unit = units_of(N)
-    scaled = N * np.outer(unit, unit)
-    m, n, index = model.m, model.n, model.index
-    out = np.zeros(m)
-    for k in range(m):
-        of_shape = index.phi.start + np.arange(n) * m + k
-        # With its shape at zero neither participation, pole nor transient of a mode show.
-        gone = np.concatenate([
-            index.gamma.start + k * model.d + np.arange(model.d),
-            [index.log_omega.start + k, index.log_ratios.start + k],
-            model.kept + k * (model.n_ends // m) + np.arange(model.n_ends // m),
-        ])  # fmt: skip
-        others = np.setdiff1d(np.arange(model.size), np.concatenate([of_shape, gone]))
-        inner = scaled[np.ix_(others, others)] + 1e-10 * np.eye(others.size)
-        cross = scaled[np.ix_(others, of_shape)]
-        left = scaled[np.ix_(of_shape, of_shape)] - cross.T @ np.linalg.solve(inner, cross)
-        phi = np.divide(p.modes.phi[:, k], unit[of_shape], out=np.zeros(n), where=unit[of_shape] > 0)
-        out[k] = phi @ left @ phi
-    return out
+    rise = joint_worth(fit, normal)
+    return np.array([rise(one) for one in np.eye(fit.model.m, dtype=bool)])
+
+
+def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArray[np.bool_]], float]:
+    """Function of some of the modes, (m,): the same without all of these together."""
+    model, N = fit.model, fit.normal if normal is None else normal
+    unit, m, n, index = units_of(N), model.m, model.n, model.index
+    inverse = np.linalg.inv(N * np.outer(unit, unit) + _LEAST_SEEN * np.eye(model.size))
+    shapes = np.arange(index.phi.stop).reshape(n, m)
+    # With its shape at zero neither participation, pole nor transient of a mode show.
+    others = np.hstack([
+        index.gamma.start + np.arange(m * model.d).reshape(m, -1), np.arange(m)[:, None] + index.log_omega.start,
+        np.arange(m)[:, None] + index.log_ratios.start, model.kept + np.arange(model.n_ends).reshape(m, -1),
+    ])  # fmt: skip
+    phi = np.divide(fit.parameters.modes.phi.ravel(), unit[index.phi], out=np.zeros(n * m), where=unit[index.phi] > 0)
+
+    def rise(modes: NDArray[np.bool_]) -> float:
+        of_shapes = shapes[:, modes].ravel()
+        gone = np.concatenate([of_shapes, others[modes].ravel()])
+        # The inverse of this block is the normal matrix of these less what all others explain of it.
+        left = np.linalg.inv(inverse[np.ix_(gone, gone)])[: of_shapes.size, : of_shapes.size]
+        return float(phi[of_shapes] @ left @ phi[of_shapes])
+
+    return rise

@@ -167,6 +167,15 @@ class RecordModel(SpectralModel):
         """Numbers that the records determine: without a force the scale of each mode is none."""
         return self.size - (0 if self.force else self.m)
 
+    def scales(self, p: Parameters) -> Array:
+        """Moves of all unknowns that change nothing, (k, size): without a force, shape against load of each mode."""
+        rows, index = np.zeros((0 if self.force else self.m, self.size)), self.index
+        for k, row in enumerate(rows):
+            row[index.phi][k :: self.m] = p.modes.phi[:, k]
+            row[index.gamma][k * self.d : (k + 1) * self.d] = -p.modes.gamma[k]
+            row[self.kept : self.kept + self.n_ends].reshape(self.m, -1)[k] = -p.ends[k]
+        return rows
+
     def chunks(self, p: Parameters) -> Iterator[Chunk]:
         """See `SpectralModel`."""
         return (Chunk(self, p, run) for run in self.parts())
@@ -213,6 +222,10 @@ class HeldShapes(RecordModel):
         self.held = np.ones(self.size, bool)
         self.held[self.index.log_omega] = self.held[self.index.log_ratios] = poles
         self.held[self.kept :] = False
+
+    def scales(self, p: Parameters) -> Array:
+        """See `RecordModel`: with shapes held there are none."""
+        return np.zeros((0, self.size))
 
     @property
     def unknowns(self) -> int:

@@ -6,42 +6,69 @@ another stands out of these errors, though in no channel by itself.
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.record_fit import RecordFit, refitted, worth
+from sysid.modal_analysis.modal_model import Lines, dots
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, refitted, without, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import beyond_chance
+from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
-_PROMISING = 0.7  # of what a mode must be worth, that a few steps show
+_AT_ONCE = 16  # trial poles
+_APART = 10.0  # half half-power widths between further modes that are tried together
+PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
 def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
-    """The fit with further modes, one after the other, as long as each is worth more than noise.
+    """The fit with further modes as long as each is worth more than noise.
 
-    Where lines are many, `some` is the test at a few of them, as in `refitted`.
+    Those of all peaks are tried together, as many as there are modes at most; where they are not worth it, the
+    worthiest alone. Where lines are many, `some` is the test at a few of them, as in `refitted`.
     """
     while True:
-        least = least_worth(fit.model)
-        p = _candidate(fit, least)
-        if p is None:
-            return fit
-        more = refitted(fit, p, rough=True, some=some, monitor=monitor)
-        if more.likelihood - fit.likelihood < _PROMISING * least or np.any(no_modes(more)):
-            return fit
-        more = refitted(more, more.parameters, some=some, monitor=monitor)
-        if more.likelihood - fit.likelihood < least or np.any(no_modes(more)) or np.min(worth(more)) < least:
+        peaks = peaks_of(fit, least_worth(fit.model))[: fit.model.m]
+        more = _with_peaks(fit, peaks, some, monitor)
+        if more is None and len(peaks) > 1:
+            more = _with_peaks(fit, peaks[:1], some, monitor)
+        if more is None:
             return fit
         fit = more
         monitor.keep(fit)
+
+
+def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, monitor: FitMonitor) -> RecordFit | None:
+    """The fit with modes at these peaks, less those that a few steps show to be worth too little; None without any."""
+    least, m, p = least_worth(fit.model), fit.model.m, fit.parameters
+    for peak in peaks:
+        p = _with(fit, p, peak)
+    monitor.doing = f"{m} modes and {len(peaks)} more"
+    while p.modes.omega.size > m:
+        more = refitted(fit, p, limits=ROUGH, some=some, monitor=monitor)
+        poor = no_modes(more)
+        if p.modes.omega.size > m + 1:
+            poor |= worth(more) < PROMISING * least
+        poor[:m] = False
+        if not np.any(poor):
+            break
+        p = without(more, poor)
+    added = p.modes.omega.size - m
+    if added == 0 or more.likelihood - fit.likelihood < PROMISING * added * least or np.any(no_modes(more)):
+        return None
+    more = refitted(more, more.parameters, limits=TRIAL, some=some, monitor=monitor)
+    if not more.settled or more.likelihood - fit.likelihood < added * least:
+        return None
+    return None if np.any(no_modes(more)) or np.min(worth(more)) < least else more
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
@@ -57,46 +84,124 @@ def least_worth(model: RecordModel) -> float:
     return beyond_chance(model.channels + inputs + 1, len(_RATIOS) * model.numbers) / 2
 
 
-def _candidate(fit: RecordFit, least: float) -> Parameters | None:
-    """The parameters with one more mode, where its likeliest residue of rank one is worth more than `least`."""
-    model, p = fit.model, fit.parameters
+class Peak(NamedTuple):
+    """A further mode: its pole, rad/s, its shape at all channels (c,), and its load by all inputs."""
+
+    omega: float
+    ratio: float
+    shape: Array
+    load: Array
+
+
+class Trials(NamedTuple):
+    """Trial poles, and what the errors of a fit hold of a mode of rank one at each.
+
+    Attributes
+    ----------
+    omega, ratios : (K,)
+    gradient : (K, c, inputs)
+        Of ``e' S^-1 e`` / 2 by the residue.
+    weights : (K, c, c)
+        Mean inverse covariance of the errors about the pole.
+    power : (K, inputs, inputs)
+        Of the motion that each input makes. The normal matrix of residues is nearly its product with the weights.
+    """
+
+    omega: Array
+    ratios: Array
+    gradient: Array
+    weights: Array
+    power: Array
+
+    def likeliest(self) -> tuple[Array, Array, Array]:
+        """Fall of ``e' S^-1 e`` by the likeliest residue of rank one, (K,), its shape (K, c) and load (K, inputs)."""
+        of_channels, of_inputs = (_unit(np.diagonal(m, axis1=1, axis2=2)) for m in (self.weights, self.power))
+        gradient = self.gradient * of_channels[:, :, None] * of_inputs[:, None]
+        shapes = np.linalg.solve(self.weights * _outer(of_channels), gradient)
+        lam, V = np.linalg.eigh(self.power * _outer(of_inputs))
+        root = V * _unit(np.where(lam > ROUND_OFF * lam[:, -1:], lam, 0.0))[:, None]
+        worth, turn = np.linalg.eigh(root.swapaxes(1, 2) @ gradient.swapaxes(1, 2) @ shapes @ root)
+        load = np.einsum("kij,kj->ki", root, turn[:, :, -1])
+        return worth[:, -1], of_channels * np.einsum("kci,ki->kc", shapes, load), of_inputs * load
+
+
+def _unit(squares: Array) -> Array:
+    """One over the roots; zero for zeros."""
+    return np.divide(1.0, np.sqrt(squares), out=np.zeros_like(squares), where=squares > 0)
+
+
+def _outer(rows: Array) -> Array:
+    """Products of the entries of each row with one another."""
+    return rows[:, :, None] * rows[:, None]
+
+
+def trials_of(fit: RecordFit) -> Trials:
+    """Trial poles at all frequencies of the lines, in steps of half a half-power width, of three damping ratios."""
+    ends = 2 * np.pi * fit.test.freq[[0, -1]]
+    trials = [np.geomspace(ends[0], ends[1], int(np.log(ends[1] / ends[0]) / ratio) + 2) for ratio in _RATIOS]
+    omega, ratios = np.concatenate(trials), np.repeat(_RATIOS, [one.size for one in trials])
+    model, K = fit.model, omega.size
     c, inputs = model.channels, model.d + 2 * len(model.moving)
-    best, found = least, None
-    errors = [chunk.weighed_errors(fit.levels) for chunk in model.chunks(p)]
-    for ratio in _RATIOS:
-        ends = 2 * np.pi * fit.test.freq[[0, -1]]
-        count = int(np.log(ends[1] / ends[0]) / ratio) + 2
-        for omega in np.geomspace(ends[0], ends[1], count):
-            gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
-            for w, inputs_there, seen, inverse in errors:
-                near = slice(*np.searchsorted(w, omega * (1 + np.array([-1, 1]) * 2 * _REACH * ratio)))
-                if near.start == near.stop:
-                    continue
-                g = gains(w[near] / (2 * np.pi), np.array([omega]), np.array([ratio]))[0]
-                moved = g * inputs_there[:, near]
-                gradient += (seen[:, near] @ moved.conj().T).real
-                # So many in a half-power width tell the mean covariance.
-                step = max(1, (near.stop - near.start) // int(2 * _REACH * 16))
-                strength = step * np.abs(g[::step]) ** 2
-                S += np.einsum("cel,l->ce", inverse[:, :, near][:, :, ::step], strength).real
-                U += (moved @ moved.conj().T).real
-                power += float(np.sum(strength))
-            used = np.diag(U) > 0
-            if power == 0 or not np.any(used):
-                continue
-            # The normal matrix of residues is nearly that of the inputs times the mean inverse covariance.
-            left, right = _inverse_root(S / power), _inverse_root(U[np.ix_(used, used)])
-            u, s, vt = np.linalg.svd(left @ gradient[:, used] @ right)
-            if s[0] ** 2 > best:
-                push = np.zeros(inputs)
-                push[used] = right @ vt[0]
-                best, found = float(s[0] ** 2), (float(omega), ratio, left @ u[:, 0] * s[0], push)
-    return None if found is None else _with(fit, *found)
+    out = Trials(omega, ratios, np.zeros((K, c, inputs)), np.zeros((K, c, c)), np.zeros((K, inputs, inputs)))
+    strength = np.zeros(K)
+    cuts = np.concatenate([[0], np.cumsum([one.size for one in trials])])
+    blocks = [slice(i, min(i + _AT_ONCE, b)) for a, b in pairwise(cuts) for i in range(a, b, _AT_ONCE)]
+    for chunk in model.chunks(fit.parameters):
+        _add(out, strength, blocks, chunk, fit.levels)
+    used = strength > 0
+    out.weights[used] /= strength[used, None, None]
+    return Trials(*(part[used] for part in out))
 
 
-def _with(fit: RecordFit, omega: float, ratio: float, shape: Array, push: Array) -> Parameters:
+def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, levels: Array) -> None:
+    """Add some lines to the sums of all trials whose poles are near."""
+    w, weighed, V = chunk.run.w, chunk.weighed(levels), chunk.covered(levels)
+    inputs, square = chunk.inputs(weighed.base), chunk.deviations(levels)[0] ** 2
+    moved = np.any(inputs, axis=1)
+    u = inputs[moved]
+    errors = (weighed.whitened_residual[:, None] * u.conj()).reshape(-1, w.size)
+    pairs = (u[:, None] * u.conj()).real.reshape(-1, w.size)
+    for block in blocks:
+        omega, ratios = trials.omega[block], trials.ratios[block]
+        reach = 2 * _REACH * ratios[:, None] * omega[:, None]
+        first, last = np.searchsorted(w, [(omega - reach[:, 0]).min(), (omega + reach[:, 0]).max()])
+        if first == last:
+            continue
+        near = slice(int(first), int(last))
+        g = gains(w[near] / (2 * np.pi), omega, ratios)
+        g *= np.abs(w[near] - omega[:, None]) <= reach
+        power = g.real**2 + g.imag**2
+        trials.gradient[block][:, :, moved] += dots(g, errors[:, near]).reshape(omega.size, -1, len(u))
+        trials.power[block][np.ix_(np.arange(omega.size), moved, moved)] += (power @ pairs[:, near].T).reshape(
+            omega.size, len(u), len(u)
+        )
+        # So many lines in a half-power width tell the mean covariance.
+        step = max(1, int(np.count_nonzero(g[0])) // int(2 * _REACH * 16))
+        thin = step * power[:, ::step]
+        hidden = (V[:, :, near][:, :, ::step].swapaxes(0, 1)[None] * np.sqrt(thin)[:, None, None]).view(float)
+        hidden = hidden.reshape(omega.size, len(square), -1)
+        total = thin.sum(axis=1)
+        trials.weights[block] += np.diag(square) * total[:, None, None] - hidden @ hidden.swapaxes(1, 2)
+        strength[block] += total
+
+
+def peaks_of(fit: RecordFit, least: float) -> list[Peak]:
+    """Modes that the errors of a fit hold, worth more than `least`, far apart, the worthiest first."""
+    trials = trials_of(fit)
+    worth, shapes, loads = trials.likeliest()
+    found: list[int] = []
+    for at in np.argsort(-worth):
+        if worth[at] <= least:
+            break
+        apart = np.abs(np.log(trials.omega[at] / trials.omega[found]))
+        if np.all(apart > _APART * np.maximum(trials.ratios[at], trials.ratios[found])):
+            found.append(int(at))
+    return [Peak(trials.omega[at], trials.ratios[at], shapes[at], loads[at]) for at in found]
+
+
+def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
     """Parameters with one more mode."""
-    p, model = fit.parameters, fit.model
+    model, (omega, ratio, shape, push) = fit.model, peak
     n, d = model.n, model.d
     phi, gamma = shape[:n], push[:d]
     if model.force and np.linalg.norm(gamma) > 0:
@@ -110,9 +215,3 @@ def _with(fit: RecordFit, omega: float, ratio: float, shape: Array, push: Array)
         np.append(modes.ratios, ratio),
     )  # fmt: skip
     return Parameters(more, p.rigid, np.vstack([p.ends, push[d:]]), p.traces)
-
-
-def _inverse_root(matrix: Array) -> Array:
-    lam, V = np.linalg.eigh(matrix)
-    some = lam > 1e-10 * lam[-1]
-    return (V[:, some] / np.sqrt(lam[some])) @ V[:, some].T

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.modal_analysis.modal_model import base_noise, dots
 from sysid.modal_analysis.record_colour import designs
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.structure.structure import Array, ComplexArray
@@ -119,22 +120,46 @@ def _of_run(parts: list[ErrorSpectra], D: dict[int, Array], levels: Array, least
 
 
 def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tuple[float, Array, Array]:
-    """Log-likelihood, and its score and Fisher information by the numbers of which variances are made."""
+    """Log-likelihood, and its score and Fisher information by the numbers of which variances are made.
+
+    In units of the noise ``S^-1 = I - V V'``, V as many columns as base directions: no matrix of all channels a line.
+    """
     value, score, fisher = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
     for error, H, density, piece in parts:
-        c, v = error.shape[0], np.exp(D[piece] @ x)
-        T, e = np.moveaxis(H, -1, 0), error.T
-        S = np.einsum("lcd,d,led->lce", T, density * v[c:], T.conj(), optimize=True)
-        S[:, np.arange(c), np.arange(c)] += density * v[:c]
-        G = np.linalg.inv(S)
-        Ge, GT = np.einsum("lce,le->lc", G, e), G @ T
-        TGT = np.einsum("lcd,lce->lde", T.conj(), GT)
-        TGe = np.einsum("lcd,lc->ld", T.conj(), Ge)
-        value -= float(np.sum(np.linalg.slogdet(S)[1]) + np.sum(np.einsum("lc,lc->l", e.conj(), Ge).real))
-        excess = np.concatenate([np.abs(Ge) ** 2 - np.einsum("lcc->lc", G).real,
-                              np.abs(TGe) ** 2 - np.einsum("ldd->ld", TGT).real], axis=1)  # fmt: skip
-        score += D[piece].T @ (density * v * excess.sum(axis=0))
-        between = np.sum(np.abs(GT) ** 2, axis=0)
-        pairs = np.block([[np.sum(np.abs(G) ** 2, axis=0), between], [between.T, np.sum(np.abs(TGT) ** 2, axis=0)]])
-        fisher += D[piece].T @ (density**2 * np.outer(v, v) * pairs) @ D[piece]
+        c, v = error.shape[0], density * np.exp(D[piece] @ x)
+        scale = 1 / np.sqrt(v[:c])
+        V, factor = base_noise(H, scale, np.sqrt(v[c:]))
+        e = scale[:, None] * error
+        inner = np.sum(V.conj() * e, axis=1)
+        Ge = e - np.sum(V * inner[:, None], axis=0)
+        inverse = np.moveaxis(np.linalg.inv(np.moveaxis(factor, -1, 0)), 0, -1)  # of L, (d, d, L)
+        GT = np.einsum("icl,ijl->jcl", V, inverse)
+        TGe = np.sum(GT.conj() * e, axis=1)
+        TGT = np.eye(len(V))[:, :, None] - np.einsum("kil,kjl->ijl", inverse.conj(), inverse)
+        size = error.shape[1]
+        diagonal = np.diagonal(factor).real
+        value -= float(2 * np.sum(np.log(diagonal)) + size * np.sum(np.log(v[:c])))
+        value -= float(np.vdot(e, e).real - np.vdot(inner, inner).real)
+        hidden = np.sum(_squares(V), axis=(0, 2))
+        excess = [np.sum(_squares(Ge), axis=1) - size + hidden, np.sum(_squares(TGe) - np.diagonal(TGT).T.real, axis=1)]
+        score += D[piece].T @ np.concatenate(excess)
+        between = np.sum(_squares(GT), axis=2).T
+        pairs = np.block([[np.diag(size - 2 * hidden) + _outer_squares(V), between],
+                          [between.T, np.sum(_squares(TGT), axis=2)]])  # fmt: skip
+        fisher += D[piece].T @ pairs @ D[piece]
     return value, score, fisher
+
+
+def _squares(values: ComplexArray) -> Array:
+    """Squares of moduli."""
+    return np.asarray(values.real**2 + values.imag**2)
+
+
+def _outer_squares(V: ComplexArray) -> Array:
+    """Squares of the moduli of the entries of ``V V'``, summed over the lines, (c, c), for V (d, c, L)."""
+    out = np.zeros((V.shape[1],) * 2)
+    for i, one in enumerate(V):
+        for j in range(i + 1):
+            product = one * V[j].conj()
+            out += (2 - (i == j)) * dots(product, product)
+    return out

@@ -30,7 +30,7 @@ def without_spurious_modes(
     Where lines are many, `some` is the test at a few of them, as in `refitted`.
     """
     first, test = fit, fit.test
-    while (least := _spurious(fit)) is not None:
+    while np.any(least := _spurious(fit)):
         # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes
         fit = record_modes(some or test, modes.omega, modes.ratios, monitor=monitor)
@@ -40,13 +40,13 @@ def without_spurious_modes(
     return without_spurious_modes(fit, some=some, monitor=monitor)
 
 
-def _spurious(fit: RecordFit) -> int | None:
-    """The mode that is worth least beyond what the model misses, if too little."""
-    if fit.parameters.modes.omega.size == 1 or not uneven(fit):
-        return None
+def _spurious(fit: RecordFit) -> NDArray[np.bool_]:
+    """The mode that is worth least beyond what the model misses, if too little, (m,)."""
+    m = fit.parameters.modes.omega.size
+    if m == 1 or not uneven(fit):
+        return np.zeros(m, bool)
     value = worth_beyond_misfit(fit)
-    least = int(np.argmin(value))
-    return least if value[least] < _MORE * least_worth(fit.model) else None
+    return (np.arange(m) == np.argmin(value)) & (value < _MORE * least_worth(fit.model))
 
 
 def worth_beyond_misfit(fit: RecordFit) -> Array:

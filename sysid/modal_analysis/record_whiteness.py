@@ -49,10 +49,13 @@ def noise_powers(fit: RecordFit) -> list[Array]:
     """Squares of the noise of each channel as all errors tell it, over their variances, (c + d, lines) a run."""
     parts: list[list[Array]] = [[] for _ in range(fit.test.n_runs)]
     for chunk in fit.model.chunks(fit.parameters):
-        _, _, seen, inverse = chunk.weighed_errors(fit.levels)
-        of_outputs = np.einsum("ccl->cl", inverse).real
-        base = np.einsum("cdl,cl->dl", chunk.H.conj(), seen)
-        of_base = np.einsum("cdl,cel,edl->dl", chunk.H.conj(), inverse, chunk.H, optimize=True).real
+        seen, V = chunk.weighed(fit.levels).whitened_residual, chunk.covered(fit.levels)
+        squares = chunk.deviations(fit.levels)[0][:, None] ** 2
+        of_outputs = squares - np.sum(np.abs(V) ** 2, axis=0)
+        H = chunk.H.swapaxes(0, 1)
+        base = np.sum(H.conj() * seen, axis=1)
+        hidden = sum(np.abs(np.sum(H.conj() * part, axis=1)) ** 2 for part in V)
+        of_base = np.sum(squares * np.abs(H) ** 2, axis=1) - hidden
         both, size = np.abs(np.concatenate([seen, base])) ** 2, np.concatenate([of_outputs, of_base])
         parts[chunk.run.number].append(both / np.where(size > 0, size, np.inf))
     return [np.concatenate(part, axis=1) for part in parts]

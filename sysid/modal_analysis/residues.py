@@ -290,7 +290,7 @@ class SubsetFits:
         functions = records.functions(omega, ratios, velocity=velocity)
         basis, R, _ = orthonormal(functions)
         self.records, self.size = records, omega.size
-        self.per_pole = functions.count * records.data.shape[1] + 2
+        self.per_pole = functions.per_pole * records.data.shape[1] + 2
         by_pole = functions.in_order([R.T]).T  # no gain depends on the scale of columns
         self._columns = by_pole.reshape(len(R), omega.size, -1)
         self._answered = basis.answers(records.data)
@@ -362,9 +362,9 @@ def _least_squares(functions: PoleFunctions, data: Array, size: float) -> Residu
     inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
     inverse /= size_of_column[:, None]
     inverse = functions.in_order([inverse])
-    count = functions.count
-    beta = (inverse @ y).reshape(-1, count, data.shape[1])
-    return ResidueFit(basis, beta, inverse.reshape(len(beta), count, -1), data, y, size)
+    inputs = functions.per_pole
+    beta = (inverse @ y).reshape(-1, inputs, data.shape[1])
+    return ResidueFit(basis, beta, inverse.reshape(len(beta), inputs, -1), data, y, size)
 
 
 def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:

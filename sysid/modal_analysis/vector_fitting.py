@@ -275,7 +275,7 @@ def _settled(
     size = omega.size + 1
     while 0 < omega.size < size:
         size = omega.size
-        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity)
+        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity, most_damped=DAMPED)
         omega, ratios = _prune(records, omega, ratios, progress, velocity=velocity)
     return omega, ratios
 
@@ -294,6 +294,7 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     least_left = NEGLIGIBLE**2 * plain.squares()
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     least = _least_gain(without_velocity)
+    tried = -1
     for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
         progress.tell()
         trial, products = fit.beside(plain)
@@ -301,8 +302,9 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
         gain = np.sum(products**2, axis=1) / np.where(left > least_left, left, np.inf)
         gain = gain.reshape(at.size, -1).sum(axis=1)
         best = int(np.argmax(gain))
-        if gain[best] <= least * _noise(records, fit, omega.size):
+        if best == tried or gain[best] <= least * _noise(records, fit, omega.size):
             continue
+        tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
         if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
             return more
@@ -348,9 +350,19 @@ def _prune(
 
 
 def _polish(
-    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
+    records: Records,
+    omega: Array,
+    ratios: Array,
+    progress: _Progress,
+    *,
+    velocity: bool = False,
+    most_damped: float = np.inf,
+    steps: int = 100,
 ) -> tuple[Array, Array]:
-    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
+    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated.
+
+    They end where a pole is damped more than `most_damped`: it is to be removed, and the others may move then.
+    """
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
@@ -364,7 +376,7 @@ def _polish(
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial, velocity)
         if lower < error:
-            done = error - lower < NEGLIGIBLE * error
+            done = error - lower < NEGLIGIBLE * error or bool(np.any(trial[m:] >= np.log(most_damped)))
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break
@@ -388,7 +400,7 @@ def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array
     slopes = records.of_poles([by_pole[:, i] for i in range(by_pole.shape[1])])
     beside, products = fit.beside(slopes)
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.size, -1)
-    d = slopes.count
+    d = slopes.per_pole
     H = (beside.gram() * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
     slope = np.sum(products * residues, axis=1).reshape(2 * m, d).sum(axis=1)
     return fit.squared_error, H, slope

@@ -1,0 +1,130 @@
+"""Judgement of modes of whole records, by products of many at once, against plain loops and matrices written out."""
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
+from sysid.modal_analysis.record_more import peaks_of, trials_of
+from sysid.modal_analysis.record_noise import ErrorSpectra, _likelihood
+
+RATE, SECONDS = 40.0, 40.0
+REACH = 15.0  # half-power widths
+
+
+def two_runs(force):
+    """Two runs of three storeys with 2 % noise; the second stands still at both ends."""
+    rng = np.random.default_rng(3)
+    K = np.array([[5e3, -2e3, 0, -3e3], [-2e3, 4e3, -2e3, 0], [0, -2e3, 2e3, 0], [-3e3, 0, 0, 3e3]])
+    structure = sysid.Structure(np.diag([2.0, 1.5, 1.0, 1.0]), K, [0.01, 0.012, 0.02], n_base=1)
+    runs = []
+    for _ in range(2):
+        base = rng.standard_normal((1, int(RATE * SECONDS)))
+        clean = (base, structure.simulate(base, RATE), structure.simulate_force(base, RATE))
+        noisy = [one + 0.02 * np.std(one) * rng.standard_normal(one.shape) for one in clean]
+        runs.append((*noisy[:2], noisy[2] if force else None))
+    test = sysid.Measurement.from_time(
+        runs, RATE, rigid_body=np.ones((3, 1)), band=(1.0, 15.0), estimator="records", at_rest=[False, True]
+    )
+    return test, 2 * np.pi * structure.natural_frequencies
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["force", "no force"])
+def fit_of_two(request):
+    """The two lowest of three modes."""
+    test, omega = two_runs(request.param)
+    fit = record_modes(test, omega[:2], np.full(2, 0.012))
+    return refitted(fit, fit.parameters), omega[2]
+
+
+def inverse_root(matrix):
+    lam, V = np.linalg.eigh(matrix)
+    return V / np.sqrt(lam) @ V.T
+
+
+def fall(fit, omega, ratio):
+    """Fall of e' S^-1 e by the likeliest residue of rank one at a pole, line by line."""
+    model = fit.model
+    c, inputs = model.channels, model.d + 2 * len(model.moving)
+    gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
+    for chunk in model.chunks(fit.parameters):
+        run, levels = chunk.run, fit.levels[chunk.run.piece] * chunk.run.density
+        u = chunk.inputs(chunk.weighed(fit.levels).base)
+        for at in np.flatnonzero(np.abs(run.w - omega) <= 2 * REACH * ratio * omega):
+            w, T = run.w[at], chunk.H[:, :, at]
+            inverse = np.linalg.inv(np.diag(levels[:c]) + T @ np.diag(levels[c:]) @ T.conj().T)
+            g = w**2 / (omega**2 - w**2 + 2j * ratio * omega * w)
+            gradient += np.outer(inverse @ chunk.error[:, at], (g * u[:, at]).conj()).real
+            S += abs(g) ** 2 * inverse.real
+            U += abs(g) ** 2 * np.outer(u[:, at], u[:, at].conj()).real
+            power += abs(g) ** 2
+    size = np.sqrt(np.diag(U))
+    return (
+        np.linalg.svd(inverse_root(S / power) @ (gradient / size) @ inverse_root(U / np.outer(size, size)))[1][0] ** 2
+    )
+
+
+def test_worth_of_trial_poles_is_that_of_a_plain_loop(fit_of_two):
+    fit, _ = fit_of_two
+    trials = trials_of(fit)
+    worth_of_each, shapes, loads = trials.likeliest()
+    assert set(trials.ratios) == {0.004, 0.012, 0.036}
+    for k in np.random.default_rng(0).choice(worth_of_each.size, 8, replace=False):
+        assert worth_of_each[k] == pytest.approx(fall(fit, trials.omega[k], trials.ratios[k]), rel=1e-8)
+        # The fall of the quadratic that gradient and normal matrix make, at this residue.
+        residue = np.outer(shapes[k], loads[k])
+        bend = np.einsum("ci,ce,ij,ej->", residue, trials.weights[k], trials.power[k], residue)
+        assert 2 * np.sum(trials.gradient[k] * residue) - bend == pytest.approx(worth_of_each[k], rel=1e-8)
+
+
+def test_the_mode_that_is_missing_is_the_worthiest_peak(fit_of_two):
+    fit, missing = fit_of_two
+    peaks = peaks_of(fit, 30.0)
+    assert peaks[0].omega == pytest.approx(missing, rel=0.03)
+    for i, one in enumerate(peaks):
+        apart = [abs(np.log(one.omega / other.omega)) for other in peaks[:i]]
+        assert all(distance > 2 * one.ratio for distance in apart)
+
+
+def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
+    fit, _ = fit_of_two
+    model, p, unit = fit.model, fit.parameters, units_of(fit.normal)
+    N, index = fit.normal * np.outer(unit, unit), fit.model.index
+
+    def by_solving(modes):
+        shape = np.array([index.phi.start + s * model.m + k for k in modes for s in range(model.n)])
+        ends = model.n_ends // model.m
+        gone = [
+            at for k in modes for at in (
+                *(index.gamma.start + k * model.d + np.arange(model.d)), index.log_omega.start + k,
+                index.log_ratios.start + k, *(model.kept + k * ends + np.arange(ends)),
+            )
+        ]  # fmt: skip
+        others = np.setdiff1d(np.arange(model.size), np.concatenate([shape, gone]))
+        cross = N[np.ix_(others, shape)]
+        inner = N[np.ix_(others, others)] + 1e-10 * np.eye(others.size)
+        left = N[np.ix_(shape, shape)] - cross.T @ np.linalg.solve(inner, cross)
+        phi = p.modes.phi[:, modes].T.ravel() / unit[shape]
+        return phi @ left @ phi
+
+    np.testing.assert_allclose(worth(fit), [by_solving([0]), by_solving([1])], rtol=1e-5)
+    assert joint_worth(fit)(np.array([True, True])) == pytest.approx(by_solving([0, 1]), rel=1e-5)
+
+
+def test_the_likelihood_of_levels_is_that_of_covariances_written_out():
+    rng = np.random.default_rng(1)
+    c, d, lines, density = 4, 2, 15, 0.7
+    z = rng.standard_normal((2, c, 1 + d, lines))
+    e, H = z[0, :, 0] + 1j * z[1, :, 0], z[0, :, 1:] + 1j * z[1, :, 1:]
+    x = rng.uniform(-1, 1, c + d)
+    value, _, fisher = _likelihood([ErrorSpectra(e, H, density, 0)], {0: np.eye(c + d)}, x)
+    v, made, information = density * np.exp(x), 0.0, np.zeros((c + d, c + d))
+    for at in range(lines):
+        directions = np.hstack([np.eye(c), H[:, :, at]])
+        S = (directions * v) @ directions.conj().T
+        slopes = [v[i] * np.outer(directions[:, i], directions[:, i].conj()) for i in range(c + d)]
+        G = np.linalg.inv(S)
+        made -= np.linalg.slogdet(S)[1] + (e[:, at].conj() @ G @ e[:, at]).real
+        information += [[np.trace(G @ a @ G @ b).real for b in slopes] for a in slopes]
+    assert value == pytest.approx(made, rel=1e-12)
+    np.testing.assert_allclose(fisher, information, rtol=1e-10)
