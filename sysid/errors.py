@@ -132,7 +132,7 @@ def is_control(letter: str) -> bool:
 
 def shown_plainly(text: str) -> str:
     """A text with its control characters, but for line feeds and tabs, written as Python writes them."""
-    if text.isascii() and text.isprintable():
+    if text.isprintable():  # marks that turn the direction are not
         return text
     return "".join(
         letter.encode("unicode_escape").decode() if is_control(letter) and letter not in "\n\t" else letter

@@ -42,12 +42,11 @@ def ctrl_c():
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Leave the pictures of a report out, which take most of its time."""
-    from sysid.report import matrices, report
+    from sysid.report import report
 
-    for room in (report, matrices):
-        monkeypatch.setattr(
-            room, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
-        )
+    monkeypatch.setattr(
+        report, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
+    )
 
 
 def _geometry(rng, n, d):

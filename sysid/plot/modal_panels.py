@@ -108,9 +108,12 @@ def _indicator(test: Measurement) -> tuple[Array, str, str]:
 
 def _log_magnitude(ax: Axes, values: Array, *, room: bool) -> None:
     """Logarithmic axis over seven decades at most (what lies below is arithmetic), with room for a remark on top."""
+    from matplotlib.ticker import NullLocator
+
     if np.any(values > 0):
         top = float(values.max())
         ax.set_yscale("log")
+        ax.yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
         ax.set_ylim(max(0.5 * float(values[values > 0].min()), 1e-7 * top), (20 if room else 2) * top)
 
 

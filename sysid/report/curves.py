@@ -23,7 +23,7 @@ from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import LIKELY
 
-_FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
+_FINE, _ROUGH = 1.8e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
 
 
 @cache

@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sysid.errors import shown_plainly
-from sysid.plot.canvas import to_png
+from sysid.plot.canvas import heat_map, to_png
 from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
@@ -65,6 +65,9 @@ th:first-child, td:first-child { text-align: left; } td:first-child { font-weigh
 .words td:first-child { white-space: nowrap; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
 img { max-width: 100%; height: auto; display: block; background: #fff; }
+.maps { display: flex; flex-wrap: wrap; gap: 0 1.5rem; } .maps figure { flex: 0 1 300px; margin: 0; }
+.maps img { width: 300px; border: 1px solid var(--line); } .maps img, .bar { image-rendering: pixelated; }
+.bar { display: inline-block; width: 160px; height: .8em; vertical-align: middle; }
 pre { background: var(--fill); padding: .8rem 1rem; font-size: .82rem; line-height: 1.45; white-space: pre-wrap;
   overflow-wrap: anywhere; }
 nav { margin: .8rem 0; font-size: .9rem; }
@@ -85,7 +88,8 @@ svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke
 svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
 svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
-svg .dot { fill: var(--found); } .dot circle { r: 3px; } svg .base { fill: var(--soft); }
+svg .dot { fill: var(--found); } svg .dots { stroke: var(--found); stroke-width: 6; stroke-linecap: round; }
+svg .base { fill: var(--soft); }
 .legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
 .key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
@@ -107,6 +111,7 @@ svg .dot { fill: var(--found); } .dot circle { r: 3px; } svg .base { fill: var(-
   .shapes svg { display: inline-block; width: 24%; }
   .shapes, .sheets { orphans: 1; widows: 1; }
   .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
+  .maps { display: block; } .maps figure { display: inline-block; width: 32%; } .maps img { width: 100%; }
   .pair { flex-wrap: nowrap; break-inside: avoid; } .pair figure { flex-basis: 0; }
   table { font-size: 7.5pt; } .words { font-size: 9pt; } .wide { font-size: 5.5pt; }
   th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
@@ -216,14 +221,31 @@ def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
     return [[()] * shape[1] for _ in range(shape[0])]
 
 
-def picture(
-    figure: Figure, alt: object, caption: object = "", *, dpi: float = 130, colours: int | None = 128, label: str = ""
-) -> str:
-    """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
-    width = round(92 * float(figure.get_size_inches()[0]))
-    data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
-    image = f'<img width="{width}" alt="{escaped(alt)}" src="data:image/png;base64,{data}">'
+def picture(figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15) -> str:
+    """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens.
+
+    Its margins are fixed, the `right` one in inches: to find them by drawing takes as long as the picture.
+    """
+    width, height = map(float, figure.get_size_inches())
+    figure.set_layout_engine(None)
+    figure.subplots_adjust(left=0.75 / width, right=1 - right / width, bottom=1.0 / height, top=1 - 0.35 / height)
+    image = _image(to_png(figure, dpi=130, colours=64), f'width="{round(92 * width)}" alt="{escaped(alt)}"')
     return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
+
+
+def heat_maps(maps: Mapping[str, Array], colours: str, low: float, caption: object = "", *, label: str = "") -> str:
+    """Matrices beside each other, each under its name, an entry a square whose colour tells it from `low` to 1."""
+    drawn = ""
+    for name, values in maps.items():
+        image = _image(heat_map(values, colours, low), f'alt="{escaped(name)}, as colours"')
+        drawn += f"<figure>{_caption(name, '')}{image}</figure>"
+    bar = _image(heat_map(np.linspace(low, 1.0, 65)[None], colours, low), 'class="bar" alt=""')
+    scale = f"<figcaption>{number(low)} {bar} 1</figcaption>"
+    return f'{_caption(caption, label)}<div class="maps">{drawn}</div>{scale}'
+
+
+def _image(png: bytes, attributes: str) -> str:
+    return f'<img {attributes} src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}">'
 
 
 def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: str = "") -> str:

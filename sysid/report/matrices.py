@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid import plot
 from sysid.assessment.sensitivity import system_matrices
-from sysid.report.html import matrix, no_lines, number, paragraph, picture
+from sysid.plot.plots import normalised
+from sysid.report.html import heat_maps, matrix, no_lines, number, paragraph
 from sysid.results.identification import Identification
 from sysid.results.summary import half_width
 from sysid.structure.structure import Array
@@ -53,9 +53,9 @@ def matrix_tables(it: Identification) -> str:
         lower[:2] = map(_ranges, (ends.mass, ends.stiffness), lower[:2])
     parts = [
         paragraph(words, "soft"),
-        picture(
-            plot.matrices(it), "heat maps of the mass, stiffness and damping matrices", CHOSEN if label else "",
-            colours=256, label=mark,
+        heat_maps(
+            {name: normalised(A) for name, A in (("M_SS", M), ("K_SS", K), ("C", C))}, "RdBu_r", -1.0,
+            CHOSEN if label else "", label=mark,
         ),
         matrix(M, names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=mark),
         _of_base(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", mark),

@@ -18,6 +18,7 @@ from sysid.report.html import (
     beside,
     bullets,
     escaped,
+    heat_maps,
     matrix,
     number,
     page,
@@ -71,6 +72,7 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_MAC_IN_NUMBERS = 12  # modes
 _NORMALISED = "~ normalised, one of many"
 
 
@@ -371,7 +373,7 @@ def _poles(it: Identification) -> str:
     for figure in (diagram, indicator):
         figure.set_size_inches(5.6, 4.2)  # beside each other, and on a phone, at nearly the size of their words
     return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
-        picture(diagram, "stabilisation diagram"), picture(indicator, "complex mode indicator function")
+        picture(diagram, "stabilisation diagram", right=0.7), picture(indicator, "complex mode indicator function")
     )
 
 
@@ -412,13 +414,19 @@ def _falls(it: Identification) -> bool:
 
 
 def _mac(it: Identification) -> str:
+    known = it.records.reference is not None
     words = (
-        "Identified mode shapes against those of the reference at the sensors: 1 on the diagonal where they agree."
-        if it.records.reference
+        "Identified mode shapes (rows) against those of the reference (columns) at the sensors: 1 on the diagonal "
+        "where they agree."
+        if known
         else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
         "these sensors cannot tell apart."
     )
-    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion", colours=256)
+    drawn, numbers = heat_maps({"MAC": it.mac}, "Blues", 0.0), ""
+    if max(it.mac.shape) <= _MAC_IN_NUMBERS:
+        rows, columns = (range(1, size + 1) for size in it.mac.shape)
+        numbers = matrix(it.mac.round(3), rows, columns, "MAC" + " against the reference" * known)
+    return paragraph(words, "soft") + drawn + numbers
 
 
 def _effective_masses(it: Identification) -> str:

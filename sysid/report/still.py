@@ -160,8 +160,7 @@ def mode_still(
     joined = [_joined(where, sticks) for where in (rest, moved)]
     at_rest = f'<path id="{_AT_REST}" class="rest" d="{joined[0]}"/>' if first else f'<use href="#{_AT_REST}"/>'
     lines = f'{at_rest}<path class="identified" d="{joined[1]}"/>'
-    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}"/>' for x, y in moved[1:])
-    dots = f'<g class="dot">{dots}</g>'
+    dots = f'<path class="dots" d="{"".join(f"M{_pair(point)}h0" for point in moved[1:])}"/>'
     x, y = rest[0]
     base = f'<rect class="base" x="{x - 22:.1f}" y="{y - 3:.1f}" width="44" height="6"/>'
     base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'

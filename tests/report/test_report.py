@@ -277,7 +277,7 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
             low, high = (f"{end + 0.0:.3g}" for end in ends[:, i, j])
             assert table[i + 1][j + 1].split("|")[1:] == [f"{low} to", high]
     assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
-    assert page.words.count("one of many") == 5  # matrices; pictures are left out here
+    assert page.words.count("one of many") == 6  # matrices and their heat maps; pictures are left out here
     assert page.text.count(f"{ONE_OF_MANY} {CHOSEN}") == 2
 
 
