@@ -44,15 +44,12 @@ class Bound:
         Sensors by pivoted QR of the shapes; all of them where there are fewer than modes.
     poles : int
         Above the lines, that are unknown too.
-    left : float
-        chi² that modes add which have neither a pole nor a static residual of their own.
     """
 
     values: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
     dofs: np.ndarray
     poles: int
-    left: float
 
     @property
     def of_mass(self) -> float:
@@ -103,10 +100,10 @@ def bound(structure: Continuous, draw: Draw) -> Bound:
         left = float(known[-1, -1] - across @ inverse @ across)
         if left < layout.sensors + d + 2:
             break
-    return _of_quantities(structure, layout, inverse / np.outer(scale, scale), poles, left)
+    return _of_quantities(structure, layout, inverse / np.outer(scale, scale), poles)
 
 
-def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray, poles: int, left: float) -> Bound:
+def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray, poles: int) -> Bound:
     modes, m, d = structure.modes, structure.count, layout.d
     dofs = scipy.linalg.qr(modes.shapes[:, :m].T, mode="r", pivoting=True)[1][:m]
     ends, k = layout.ends, np.arange(m)
@@ -124,7 +121,7 @@ def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray
     slopes = complex_steps(quantities, theta)
     part = covariance[np.ix_(at, at)]
     std = {name: np.sqrt(np.einsum("p...,pq,q...->...", J, part, J, optimize=True)) for name, J in slopes.items()}
-    return Bound({name: value.real for name, value in quantities(theta).items()}, std, dofs, poles, left)
+    return Bound({name: value.real for name, value in quantities(theta).items()}, std, dofs, poles)
 
 
 def in_band(omega: np.ndarray, zeta: np.ndarray, gamma: np.ndarray, phi: np.ndarray) -> dict[str, np.ndarray]:
