@@ -28,7 +28,6 @@ from benchmarks.records.simulated import Modes
 
 CHUNK = 1000  # lines whitened at once
 STEP = 1e-30
-QUANTITIES = ("natural_frequencies", "damping_ratios", "effective_masses", "mass", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +37,8 @@ class Bound:
     Attributes
     ----------
     values, std : dict
-        "natural_frequencies" (m,), Hz, "damping_ratios" (m,), "effective_masses" (m, d, d); where there are as many
-        sensors as modes also "mass" and "stiffness" (m, m) on the sensors `dofs`.
+        "natural_frequencies" (m,), Hz, "damping_ratios" (m,), "effective_masses" (m, d, d), "mode_shapes" (m, sensors)
+        of the sensors `dofs`; where these are m also "mass" and "stiffness" (m, m) on them.
     dofs : (m,)
         Sensors by pivoted QR of the shapes; all of them where there are fewer than modes.
     poles : int
@@ -131,6 +130,7 @@ def in_band(omega: np.ndarray, zeta: np.ndarray, gamma: np.ndarray, phi: np.ndar
     """
     effective = np.einsum("ki,kj->kij", gamma, gamma)
     found = {"natural_frequencies": omega / (2 * np.pi), "damping_ratios": zeta, "effective_masses": effective}
+    found["mode_shapes"] = phi.T
     if phi.shape[0] == phi.shape[1]:
         P = np.linalg.inv(phi)
         found |= {"mass": P.T @ P, "stiffness": (P.T * omega**2) @ P}
