@@ -114,6 +114,7 @@ BENCHMARKS = (
     Benchmark("mistakes.named_mistakes", "one mistake a test: named first, right ones not accused", "6 min", "20 s"),
     Benchmark("mistakes.model_errors", "structures that change: told so, linear ones not", "5 min", "15 s"),
     Benchmark("estimate.estimate_speed", "processor time of modal fits over that of an older commit", "5 min", "15 s"),
+    Benchmark("band.continuous", "beams, frames, plates with modes beyond the lines: determined, exact", "1 h", "60 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 

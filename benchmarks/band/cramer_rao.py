@@ -28,7 +28,6 @@ from benchmarks.records.simulated import Modes
 
 CHUNK = 1000  # lines whitened at once
 STEP = 1e-30
-QUANTITIES = ("natural_frequencies", "damping_ratios", "effective_masses", "mass", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,21 +37,18 @@ class Bound:
     Attributes
     ----------
     values, std : dict
-        "natural_frequencies" (m,), Hz, "damping_ratios" (m,), "effective_masses" (m, d, d); where there are as many
-        sensors as modes also "mass" and "stiffness" (m, m) on the sensors `dofs`.
+        "natural_frequencies" (m,), Hz, "damping_ratios" (m,), "effective_masses" (m, d, d), "mode_shapes" (m, sensors)
+        of the sensors `dofs`; where these are m also "mass" and "stiffness" (m, m) on them.
     dofs : (m,)
         Sensors by pivoted QR of the shapes; all of them where there are fewer than modes.
     poles : int
         Above the lines, that are unknown too.
-    left : float
-        chi² that modes add which have neither a pole nor a static residual of their own.
     """
 
     values: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
     dofs: np.ndarray
     poles: int
-    left: float
 
     @property
     def of_mass(self) -> float:
@@ -103,10 +99,10 @@ def bound(structure: Continuous, draw: Draw) -> Bound:
         left = float(known[-1, -1] - across @ inverse @ across)
         if left < layout.sensors + d + 2:
             break
-    return _of_quantities(structure, layout, inverse / np.outer(scale, scale), poles, left)
+    return _of_quantities(structure, layout, inverse / np.outer(scale, scale), poles)
 
 
-def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray, poles: int, left: float) -> Bound:
+def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray, poles: int) -> Bound:
     modes, m, d = structure.modes, structure.count, layout.d
     dofs = scipy.linalg.qr(modes.shapes[:, :m].T, mode="r", pivoting=True)[1][:m]
     ends, k = layout.ends, np.arange(m)
@@ -124,7 +120,7 @@ def _of_quantities(structure: Continuous, layout: Layout, covariance: np.ndarray
     slopes = complex_steps(quantities, theta)
     part = covariance[np.ix_(at, at)]
     std = {name: np.sqrt(np.einsum("p...,pq,q...->...", J, part, J, optimize=True)) for name, J in slopes.items()}
-    return Bound({name: value.real for name, value in quantities(theta).items()}, std, dofs, poles, left)
+    return Bound({name: value.real for name, value in quantities(theta).items()}, std, dofs, poles)
 
 
 def in_band(omega: np.ndarray, zeta: np.ndarray, gamma: np.ndarray, phi: np.ndarray) -> dict[str, np.ndarray]:
@@ -134,6 +130,7 @@ def in_band(omega: np.ndarray, zeta: np.ndarray, gamma: np.ndarray, phi: np.ndar
     """
     effective = np.einsum("ki,kj->kij", gamma, gamma)
     found = {"natural_frequencies": omega / (2 * np.pi), "damping_ratios": zeta, "effective_masses": effective}
+    found["mode_shapes"] = phi.T
     if phi.shape[0] == phi.shape[1]:
         P = np.linalg.inv(phi)
         found |= {"mass": P.T @ P, "stiffness": (P.T * omega**2) @ P}

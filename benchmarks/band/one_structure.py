@@ -21,7 +21,7 @@ from benchmarks.modal.identification import error_text
 from benchmarks.records.coupled_records import NEAR, matched
 
 LEVEL = 0.95
-INTERVALS = ("natural_frequencies", "damping_ratios", "effective_masses")
+SYMMETRIC = ("effective_masses", "mass", "stiffness")
 
 
 @dataclass(frozen=True)
@@ -83,29 +83,42 @@ def compared(truth: Continuous, test: Draw, least: Bound) -> Figures:
 
 
 def _ratios(found: sysid.Structure, least: Bound, mine: np.ndarray) -> dict[str, list[float]]:
-    """Errors over bounds, of entries of matrices once; `mine` are the modes in the lines."""
+    """Errors over bounds; `mine` are the modes in the lines."""
     values = in_band(
         2 * np.pi * found.natural_frequencies[mine], found.damping_ratios[mine], found.participation[mine],
-        found.mode_shapes[np.ix_(least.dofs, mine)],
+        found.mode_shapes[np.ix_(least.dofs, mine)] * _signs(found, least, mine),
     )  # fmt: skip
-    return {name: (_once(values[name] - least.values[name]) / _once(std)).tolist() for name, std in least.std.items()}
+    return {
+        name: (_once(name, values[name] - least.values[name]) / _once(name, std)).tolist()
+        for name, std in least.std.items()
+    }
 
 
 def _held(result: sysid.Identification, least: Bound, mine: np.ndarray) -> dict[str, list[bool]]:
+    """Flags of the intervals of what belongs to modes, those that are told."""
     held = {}
-    for name in INTERVALS:
-        low, high = (_once(end[mine]) for end in result.uncertainty.interval(name, level=LEVEL))
-        exact = _once(least.values[name])
-        told = np.isfinite(low)
+    for name in ("natural_frequencies", "damping_ratios", "effective_masses", "mode_shapes"):
+        ends = result.uncertainty.interval(name, level=LEVEL)
+        if name == "mode_shapes":
+            ends = np.sort(ends[:, least.dofs][..., mine] * _signs(result.structure, least, mine), axis=0).swapaxes(
+                1, 2
+            )
+        else:
+            ends = ends[:, mine]
+        low, high = (_once(name, end) for end in ends)
+        exact, told = _once(name, least.values[name]), np.isfinite(low)
         held[name] = ((low <= exact) & (exact <= high))[told].tolist()
     return held
 
 
-def _once(values: np.ndarray) -> np.ndarray:
+def _signs(found: sysid.Structure, least: Bound, mine: np.ndarray) -> np.ndarray:
+    """Signs of the shapes, (m,), by which they are nearer to the true ones."""
+    return np.sign(np.sum(found.mode_shapes[np.ix_(least.dofs, mine)] * least.values["mode_shapes"].T, axis=0))
+
+
+def _once(name: str, values: np.ndarray) -> np.ndarray:
     """Values of modes as they are, of symmetric matrices each entry once."""
-    if values.ndim == 1:
-        return values
-    return values[..., *np.tril_indices(values.shape[-1])].ravel()
+    return (values[..., *np.tril_indices(values.shape[-1])] if name in SYMMETRIC else values).ravel()
 
 
 def _drive(found: sysid.Structure, truth: Continuous, test: Draw) -> float:

@@ -109,14 +109,13 @@ def of_records(structure: Continuous, rng: np.random.Generator) -> Draw:
         [(noisy.base, noisy.response, noisy.force)], rate, rigid_body=structure.modes.rigid_body,
         band=structure.lines, base_axes=structure.base,
     )  # fmt: skip
-    freq = np.fft.rfftfreq(motion.samples, 1 / rate)
-    keep = (freq >= structure.lines[0]) & (freq <= high)
+    lines = np.rint(measurement.freq * motion.samples / rate).astype(int)
     q, v = run.at_end()
     w, zeta = structure.modes.omega, structure.modes.zeta
     ends = rate * np.column_stack([w**2 * v, w**2 * q + 2 * zeta * w * v])  # it starts from rest
     root = np.sqrt(motion.samples)  # of a Fourier transform without a factor
     return Draw(
-        measurement, 2 * np.pi * freq[keep], np.fft.rfft(clean.base)[None, :, keep], ends[None],
+        measurement, 2 * np.pi * measurement.freq, np.fft.rfft(clean.base)[None, :, lines], ends[None],
         root * np.concatenate([levels.response, levels.force])[None], root * levels.base,
     )  # fmt: skip
 
