@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_spurious import without_spurious_modes

@@ -1,7 +1,7 @@
-"""Rough weights of whole records, and poles by these: noise of the base makes errors largest at the peaks.
+"""Rough weights of whole records, poles by these, and base motion that tells none.
 
-Weights need no modes: the motion of a sensor over that of the base, smoothed over some lines, is what passes the noise
-of the base on.
+Noise of the base makes errors largest at the peaks. Weights need no modes: the motion of a sensor over that of the
+base, smoothed over some lines, is what passes the noise of the base on.
 """
 
 from __future__ import annotations
@@ -65,3 +65,25 @@ def poles_of_test(test: Measurement) -> tuple[Array, Array]:
         test = replace(test, response_std=rough_deviations(test))
     found = find_poles(test)
     return found.omega, found.ratios
+
+
+def steady_sine(test: Measurement, beside: int = 3, share: float = 0.9, few: float = 0.1) -> str | None:
+    """Lack of whole records of a steady sine, in a sentence; None where the base moves at more than one frequency.
+
+    Of a sine that is cut within a cycle the largest line and those `beside` it hold this `share` of the power; they
+    must be `few`, a share of all.
+    """
+    found = []
+    for base, lines in zip(test.base, test.own_lines, strict=True):
+        freq, power = test.freq[lines], np.sum(np.abs(base[:, lines]) ** 2, axis=0)
+        peak = int(np.argmax(power))
+        near = power[max(peak - beside, 0) : peak + beside + 1]
+        if near.sum() < share * power.sum() or near.size > few * power.size:
+            return None
+        found.append(float(freq[peak]))
+    at = ", ".join(f"{f:.4g}" for f in sorted(set(found)))
+    return (
+        f"the base moves in a steady sine at {at} Hz, and its other lines hold next to nothing: such records tell the "
+        "response at these frequencies alone, and neither modes nor damping; record from before the motion begins "
+        "until it has died away, or move the base at all frequencies of interest (random motion, sweep, stepped sines)"
+    )
