@@ -101,7 +101,7 @@ def _of_accelerations(still: Measurement, near: Poles | None = None) -> tuple[Ar
     if not records.unit and records.driven < still.n_base:
         return None
     channels = records.principal(12)
-    poles = _poles(records, channels) if near is None else _relocated(records, *near, [channels] * 2)
+    poles = (near and _relocated(records, *near, [channels] * 2)) or _poles(records, channels)
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 

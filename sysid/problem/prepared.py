@@ -55,8 +55,7 @@ class Prepared:
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
-        if "modal" not in vars(self):
-            self.modal = tuple(fit_modes(test, monitor=monitor) for test in self.stated.tests)
+        self.modal = tuple(fit_modes(test, monitor=monitor) for test in self.stated.tests)
         self.screened = self._screened(monitor)
         geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
