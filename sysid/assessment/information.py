@@ -85,9 +85,9 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     the noise (half, as half of a complex error's variance is in its real part). The second are steps of order one.
     """
     unit, gauge = path.unit, path.gauge
-    sparse = scipy.sparse.csr_array(path.slope)  # mostly an identity, often nothing else
+    slope = scipy.sparse.csr_array(path.slope)  # mostly an identity, often nothing else
     whole = np.array_equal(path.slope, np.eye(unit.size))
-    of_unknowns = lambda matrix: matrix if whole else sparse.T @ matrix @ sparse  # noqa: E731
+    of_unknowns = lambda matrix: matrix if whole else slope.T @ matrix @ slope  # noqa: E731
     A = of_unknowns(A)
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     seen = size * unit > ROUND_OFF * np.max(size * unit)
@@ -108,7 +108,7 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     blind[seen] = lost / size[:, None]
     unseen = np.hstack([blind, np.eye(unit.size)[:, ~seen], gauge])
     unseen = unseen / np.linalg.norm(unseen / unit[:, None], axis=0)
-    return (normals, unseen) if whole else (sparse @ normals, sparse @ unseen)
+    return slope @ normals, slope @ unseen
 
 
 def _inverse_factor(matrix: Array) -> tuple[Array, Array]:

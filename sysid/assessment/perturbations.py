@@ -114,13 +114,6 @@ class DirectSpectra:
         return std_of(change @ self.steps, self.normals, float(np.abs(s.structure.rigid_body_mass).max()))
 
 
-def matrices_of_modes(structure: Structure, modes: Modes, moves: Perturbations) -> tuple[Array, Array, Array]:
-    """Of M_SS, K_SS and C, (n, n) each, at the degrees of freedom: see `changes_of_matrices`."""
-    changes = changes_of_matrices(structure, modes, moves)
-    mass, stiffness, damping = (moves.std(change, size) for change, size in changes)
-    return mass, stiffness, damping
-
-
 def changes_of_matrices(structure: Structure, modes: Modes, moves: Perturbations) -> Iterator[tuple[Array, Array]]:
     """Changes of M_SS, K_SS and C at the degrees of freedom, (n, n, moves), and the size of their entries, (n, n).
 

@@ -23,7 +23,6 @@ from sysid.assessment.perturbations import (
     ModalSpectra,
     Perturbations,
     changes_of_matrices,
-    matrices_of_modes,
     std_of,
 )
 from sysid.assessment.sensitivity import (
@@ -223,10 +222,10 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
-    matrices = matrices_of_modes(structure, modes, moves)
+    matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, modes, moves)]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
-        matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
+        matrices = [open_, open_, open_]  # zeros that a decoupled structure keeps included
     by_gains = Perturbations(0, *index.split(shifts))
     mass_by_gain, _ = next(changes_of_matrices(structure, modes, by_gains))
     by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))

@@ -50,8 +50,6 @@ class DirectTerms:
         Modes below the lines show, which answer like a constant too: the terms are not the rigid-body motion alone.
     misfit : float
         Relative residual of the absolute accelerations on all lines; the terms are those without lines far off the fit.
-    omega, ratios : (m,)
-        rad/s; all poles, spurious ones too.
     """
 
     rigid: Array
@@ -64,8 +62,6 @@ class DirectTerms:
     modal_mass: Array | None
     below: bool
     misfit: float
-    omega: Array
-    ratios: Array
 
 
 def direct_terms(test: Measurement) -> DirectTerms | None:
@@ -80,25 +76,21 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
     with one_thread():
-        found = _of_accelerations(still)
-        if found is None:
-            return None
-        misfit = found[2].misfit
+        every = found = _of_accelerations(still)
         for _ in range(3):  # times that lines with spikes are left out
-            spikes = found[2].spikes
-            if not spikes.any():
+            if found is None or not found[2].spikes.any():
                 break
-            still = still.at(~spikes)
+            still = still.at(~found[2].spikes)
             found = _of_accelerations(still, found[:2])
-            if found is None:
-                return None
+        if every is None or found is None:
+            return None
         omega, ratios, rigid = found
         force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
     (const, slope), (const_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
-    )  # fmt: skip
+        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every[2].misfit
+    )
 
 
 def _of_accelerations(still: Measurement, near: Poles | None = None) -> tuple[Array, Array, _Fit] | None:
@@ -110,7 +102,7 @@ def _of_accelerations(still: Measurement, near: Poles | None = None) -> tuple[Ar
     if not records.unit and records.driven < still.n_base:
         return None
     channels = records.principal(12)
-    poles = _poles(records, channels) if near is None else _relocated(records, *near, [channels] * 2)
+    poles = (near and _relocated(records, *near, [channels] * 2)) or _poles(records, channels)
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 

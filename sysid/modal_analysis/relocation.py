@@ -19,13 +19,9 @@ Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Reco
 
 
 def relocate(
-    records: Records,
-    blocks: Blocks,
-    omega: Array,
-    ratios: Array,
-    tell: Callable[[], object],
+    records: Records, blocks: Blocks, omega: Array, ratios: Array, tell: Callable[[], object],
     direct: ComplexArray | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array]:  # fmt: skip
     """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``.
 
     With `direct` (k, n_freq) functions that no pole has stand beside the sum.

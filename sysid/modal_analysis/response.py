@@ -60,16 +60,9 @@ def modal_motion(base: ComplexArray, gamma: ca.MX, gains: tuple[ca.MX, ca.MX]) -
 
 
 def residual(
-    test: Measurement,
-    phi: ca.MX,
-    gamma: ca.MX,
-    omega: ca.MX,
-    ratios: ca.MX,
-    rigid_body_mass: ca.MX,
-    *,
-    weighted: bool = False,
-    shift: float = 0.0,
-) -> ca.MX:
+    test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid_body_mass: ca.MX, *,
+    weighted: bool = False, shift: float = 0.0,
+) -> ca.MX:  # fmt: skip
     """Relative residuals, stacked: their sum of squares is the squared relative error of each record.
 
     Parameters

@@ -59,33 +59,26 @@ def fit_modes_of_lines(
     """
     fit = ModeFit(modal.records, poles, unit, monitor, max_iterations)
     fit = fit if count is None else fit.at_strongest(count)
-    fit.check_time()
+    if not monitor.allows(fit.seconds):
+        raise SolverError(
+            f"a fit of {fit.poles.omega.size} modes takes some {fit.seconds:.1g} s to set up: too little time, "
+            "nothing is identified"
+        )
     lacking = fit.lacking
-    if lacking is not None:
+    if lacking:
         return replace(modal, lacking=lacking)
-    found = fit.best() if count is None else fit.of_single_modes()
-    modes = found.modes
-    order = np.argsort(modes.omega, kind="stable")
-    modes = Modes(modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order])
-    return replace(
-        modal, phi=modes.phi, gamma=modes.gamma, omega=modes.omega, ratios=modes.ratios, rigid=found.rigid,
-        fit=replace(found, modes=modes),
-    )  # fmt: skip
+    found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
+    phi, gamma, omega, ratios = found.modes
+    order = np.argsort(omega, kind="stable")
+    modes = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
+    return replace(modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes))
 
 
 @dataclass(frozen=True, eq=False)
 class ModeFit:
     """Fit of rank-one modes at the poles of a test; a pole whose residue needs it stands for several modes.
 
-    Attributes
-    ----------
-    test : Measurement
-    poles : Poles
-    unit : (d,)
-        Size of participations, kg^½, m kg^½ for rotations.
-    monitor : IterationMonitor
-    max_iterations : int
-        Of each fit.
+    Its fields are arguments of `fit_modes_of_lines`.
     """
 
     test: Measurement
@@ -104,7 +97,7 @@ class ModeFit:
         test, records, poles = self.test, self.records, self.poles
         m, n, d = poles.omega.size, test.n_sensors, test.n_base
         single = np.ones(m, dtype=int)
-        best = self._grown(self._with(single), single)
+        best = self._grown(self.of_modes(single), single)
         # Modes of rank one may have dragged poles away from where several modes share one.
         free = records.fit(poles.omega, poles.ratios)
         noise = records.noise(free.left, free.residues.size)
@@ -114,7 +107,7 @@ class ModeFit:
         lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1), CANDIDATES)
         wanting = lacks or ranks.sum() < best.modes.omega.size
         if self._goes_on and wanting and np.any(ranks > 1):
-            other = self._grown(self._with(ranks), ranks)
+            other = self._grown(self.of_modes(ranks), ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
             if gained > np.sign(more) * beyond_chance(abs(more) * (n + d), CANDIDATES):
@@ -138,21 +131,9 @@ class ModeFit:
             kept = np.delete(kept, np.argmin(worth))
         return replace(self, poles=replace(poles, omega=poles.omega[kept], ratios=poles.ratios[kept]))
 
-    def of_single_modes(self) -> ModalFit:
-        """The fit of one mode at each pole."""
-        return self._with(np.ones(self.poles.omega.size, dtype=int))
-
-    def check_time(self) -> None:
-        """Refuse a time that cannot suffice."""
-        if not self.monitor.allows(self._seconds):
-            raise SolverError(
-                f"a fit of {self.poles.omega.size} modes takes some {self._seconds:.1g} s to set up: too little time, "
-                "nothing is identified"
-            )
-
     @property
-    def lacking(self) -> str | None:
-        """Why these records cannot fix the modes; None where they can."""
+    def lacking(self) -> str:
+        """Why these records cannot fix the modes; empty where they can."""
         test, moving = self.test, independent(self.test.base).shape[1]
         if moving < test.n_base:
             return (
@@ -166,16 +147,16 @@ class ModeFit:
                 f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {unknowns} unknowns: "
                 "add lines or runs"
             )
-        return None
+        return ""
 
     @property
     def _goes_on(self) -> bool:
         """True where nobody has stopped the fit, and there is time for another one."""
         monitor = self.monitor
-        return monitor.stopped is None and not monitor.is_over and monitor.allows(self._seconds)
+        return monitor.stopped is None and not monitor.is_over and monitor.allows(self.seconds)
 
     @property
-    def _seconds(self) -> float:
+    def seconds(self) -> float:
         """About how long it takes until a fit has its first iterate."""
         test = self.test
         return float(_SECONDS * (self.poles.omega.size * (test.n_base + 2)) ** 2 * test.n_runs * test.freq.size)
@@ -185,7 +166,7 @@ class ModeFit:
         while self._goes_on and (lacking := self._lacking_rank(best, multiplicity)) is not None:
             more = multiplicity.copy()
             more[lacking] += 1
-            again = self._with(more)
+            again = self.of_modes(more)
             gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
             noise = self._free(again, more)[1]
             if gained < beyond_chance(self.test.n_sensors + self.test.n_base, CANDIDATES) * noise:
@@ -214,7 +195,7 @@ class ModeFit:
         left[multiplicity >= min(n, d)] = 0.0
         return int(np.argmax(left)) if left.max() > 0 else None
 
-    def _with(self, multiplicity: Integers) -> ModalFit:
+    def of_modes(self, multiplicity: Integers) -> ModalFit:
         """Fit with so many modes at each pole, from its free residue's largest singular values."""
         test, poles, unit = self.test, self.poles, self.unit
         residues, _ = linear_residues(test, poles.omega, poles.ratios)

@@ -15,8 +15,7 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
 from sysid.search.matrix_coordinates import fit_in_matrices
-from sysid.search.modal_coordinates import End, fit_in_modes
-from sysid.search.scaled_unknowns import add_unknowns
+from sysid.search.modal_coordinates import End, add_unknowns, fit_in_modes
 from sysid.search.session import Session
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT

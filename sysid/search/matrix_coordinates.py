@@ -21,8 +21,7 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
-from sysid.search.modal_coordinates import End, frequencies
-from sysid.search.scaled_unknowns import add_unknowns
+from sysid.search.modal_coordinates import End, add_unknowns, frequencies
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
 from sysid.structure.triangular import lower_entries

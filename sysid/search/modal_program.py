@@ -37,17 +37,9 @@ Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
 
 
 def solve_modes(
-    modal: ModalEstimate,
-    first: Modes,
-    spectrum: Spectrum,
-    *,
-    unit: Array,
-    remainder: Array,
-    ties: Ties | None = None,
-    weights: Weights | None = None,
-    monitor: IterationMonitor,
-    max_iterations: int = 500,
-) -> ModalFit:
+    modal: ModalEstimate, first: Modes, spectrum: Spectrum, *, unit: Array, remainder: Array, ties: Ties | None = None,
+    weights: Weights | None = None, monitor: IterationMonitor, max_iterations: int = 500,
+) -> ModalFit:  # fmt: skip
     """Minimise the weighted squared error of accelerations and, where it was measured, base force.
 
     Parameters

@@ -18,8 +18,14 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.search import local
 from sysid.search.matrix_coordinates import _gauss_newton
-from sysid.search.modal_coordinates import _linear_starts, _regular_inverse, fit_in_modes, frequencies, modes_of
-from sysid.search.scaled_unknowns import add_unknowns
+from sysid.search.modal_coordinates import (
+    _linear_starts,
+    _regular_inverse,
+    add_unknowns,
+    fit_in_modes,
+    frequencies,
+    modes_of,
+)
 from sysid.search.swarm_objective import SwarmObjective
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")

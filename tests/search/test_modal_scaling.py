@@ -10,8 +10,8 @@ from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.response import weighted_error
 from sysid.nlp import IterationMonitor
+from sysid.search.modal import held_to_totals
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
-from sysid.search.mode_fit import held_to_totals
 
 
 def lines(truth, count=200):

@@ -32,8 +32,6 @@ _BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
 NUMBERS_A_RESIDUE = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 
-Estimate = tuple[Array, Array, Array]
-
 
 @dataclass(frozen=True, eq=False)
 class GainErrors:
@@ -221,7 +219,7 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
             )  # fmt: skip
 
 
-def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:
+def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Array:
     """Errors of the gains beside functions Q (rows, columns), their deviations, and these by the noise alone.
 
     The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
@@ -258,7 +256,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
         # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.
         noise, variance = np.maximum(noise, stated), variance * np.maximum(noise / stated, 1.0)
     std, least = (np.sqrt(part * np.diag(normal)) for part in (np.maximum(variance, noise), noise))
-    return np.where(observable, error, np.nan), np.where(observable, std, np.nan), np.where(observable, least, np.nan)
+    return np.where(observable, np.array([error, std, least]), np.nan)
 
 
 def _less(Q: Array, columns: Array) -> Array:
