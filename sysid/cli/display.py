@@ -107,7 +107,7 @@ class _LiveTable:
             seconds[-1] = now  # the clock of the phase at work runs on between its reports
         for p, elapsed in zip(rows, seconds, strict=True):
             count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
-            table.add_row(p.phase, count, f"{p.objective:.3e}", f"{elapsed:.1f} s")
+            table.add_row(f"{p.phase}  {p.doing}".rstrip(), count, f"{p.objective:.3e}", f"{elapsed:.1f} s")
         if not rows:
             table.add_row("preparation", "", "", f"{now:.1f} s")
         return table

@@ -97,8 +97,8 @@ def _run_command(argv: Sequence[str], out: Output) -> int:
     except SolverError as error:
         out.complain(error)
         return NOT_REACHED
-    except KeyboardInterrupt:
-        out.complain(starting.NOTHING_SAVED)
+    except KeyboardInterrupt as interrupt:
+        out.complain(": ".join(filter(None, (starting.NOTHING_SAVED, str(interrupt)))))
         return INTERRUPTED
     except Exception as error:
         log = _write_log()

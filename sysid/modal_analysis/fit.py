@@ -235,8 +235,8 @@ def fit_tests(tests: Iterable[Measurement], monitor: FitMonitor) -> tuple[ModalE
         except (Stop, KeyboardInterrupt) as stop:
             if len(every) == 1:
                 raise
-            words = str(stop) or "interrupted"
-            raise type(stop)(f"{words}, and test {number} of {len(every)} had no modes yet") from None
+            where = f"test {number} of {len(every)} had no modes yet"
+            raise type(stop)(", and ".join(filter(None, (str(stop), where)))) from None
     return tuple(found)
 
 
