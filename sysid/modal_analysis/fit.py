@@ -21,6 +21,7 @@ from sysid.modal_analysis.record_fit import (
     RecordFit,
     joint_worth,
     on_all_lines,
+    ranks_of,
     record_modes,
     refitted,
     without,
@@ -84,9 +85,10 @@ def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordF
     """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
     first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
     fit = _kept(_pruned(first, monitor, limits=ROUGH), monitor)
-    repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
-    if repeated.model.m == first.model.m:
+    ranks = ranks_of(test, poles.omega, poles.ratios)
+    if np.all(ranks == 1):
         return fit
+    repeated = record_modes(test, poles.omega, poles.ratios, ranks=ranks, monitor=monitor)
     repeated = _pruned(repeated, monitor, limits=ROUGH)
     if not _worth_more(repeated, fit, PROMISING):
         return fit

@@ -143,11 +143,14 @@ class RecordFit:
 
 
 def record_modes(
-    test: Measurement, omega: Array, ratios: Array, *, repeated: bool = False, monitor: Monitor | None = None
+    test: Measurement,
+    omega: Array,
+    ratios: Array,
+    *,
+    ranks: NDArray[np.intp] | None = None,
+    monitor: Monitor | None = None,
 ) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
-
-    At each pole there is one mode, or, with `repeated`, as many as its residue has rank.
 
     Parameters
     ----------
@@ -155,10 +158,12 @@ def record_modes(
         Of whole records.
     omega, ratios : (m,)
         Circular frequencies, rad/s, and damping ratios.
+    ranks : (m,), optional
+        Number of modes at each pole, one by default.
     monitor : callable, optional
         ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
-    first = _first(test, omega, ratios, repeated=repeated)
+    first = _first(test, omega, ratios, np.ones(omega.size, int) if ranks is None else ranks)
     model = RecordModel(test, first.modes.omega.size)
     return _fit(model, first, None, monitor or (lambda i, r: None), ROUGH)
 
@@ -311,17 +316,21 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _first(test: Measurement, omega: Array, ratios: Array, *, repeated: bool) -> Parameters:
-    """Rank-one modes nearest to free residues at given poles, one at each or `repeated`; with a force, its masses."""
+def ranks_of(test: Measurement, omega: Array, ratios: Array) -> NDArray[np.intp]:
+    """Number of modes at each pole that stand out of noise: the rank of its residue, (m,)."""
+    records = Records(test)
+    free = records.fit(omega, ratios)
+    return free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)
+
+
+def _first(test: Measurement, omega: Array, ratios: Array, ranks: NDArray[np.intp]) -> Parameters:
+    """Rank-one modes nearest to free residues, so many at each pole; with a force, its masses."""
     records = Records(test)
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
     size[size == 0] = size.max()  # a base direction that does not move: any scale will do
     u, s, vt = np.linalg.svd(residues * size)
-    ranks = np.ones(omega.size, int)
-    if repeated:
-        ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, d)
     pole = np.repeat(np.arange(omega.size), ranks)
     at = np.concatenate([np.arange(rank) for rank in ranks])
     strength = np.sqrt(s[pole, at] / size[:d].max())
