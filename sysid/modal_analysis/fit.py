@@ -21,13 +21,12 @@ from sysid.modal_analysis.record_fit import (
     RecordFit,
     joint_worth,
     on_all_lines,
-    ranks_of,
     record_modes,
     refitted,
     without,
 )
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import PROMISING, least_worth, no_modes, with_further_modes
+from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
@@ -82,24 +81,9 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
 
 
 def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordFit:
-    """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
-    first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
-    fit = _kept(_pruned(first, monitor, limits=ROUGH), monitor)
-    ranks = ranks_of(test, poles.omega, poles.ratios)
-    if np.all(ranks == 1):
-        return fit
-    repeated = record_modes(test, poles.omega, poles.ratios, ranks=ranks, monitor=monitor)
-    repeated = _pruned(repeated, monitor, limits=ROUGH)
-    if not _worth_more(repeated, fit, PROMISING):
-        return fit
-    repeated = _kept(repeated, monitor)
-    return repeated if _worth_more(repeated, fit) else fit
-
-
-def _worth_more(fit: RecordFit, other: RecordFit, share: float = 1.0) -> bool:
-    """True where a fit explains more than another by a share of what its further modes must be worth."""
-    more = max(fit.model.m - other.model.m, 0)
-    return fit.likelihood - other.likelihood > share * more * least_worth(other.model)
+    """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors."""
+    fit = _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
+    return _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
@@ -108,11 +92,6 @@ def _same_modes(modes: Modes, poles: Poles) -> bool:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
     return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
-
-
-def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
-    """A rough fit settled, and without the modes that noise explains then."""
-    return _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
 
 
 def _pruned(fit: RecordFit, monitor: Monitor | None, *, limits: Limits = WHOLE) -> RecordFit:

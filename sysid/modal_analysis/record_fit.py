@@ -142,14 +142,7 @@ class RecordFit:
         return NoiseLevels(root[..., :n], root[..., -d:], force)
 
 
-def record_modes(
-    test: Measurement,
-    omega: Array,
-    ratios: Array,
-    *,
-    ranks: NDArray[np.intp] | None = None,
-    monitor: Monitor | None = None,
-) -> RecordFit:
+def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
 
     Parameters
@@ -158,12 +151,10 @@ def record_modes(
         Of whole records.
     omega, ratios : (m,)
         Circular frequencies, rad/s, and damping ratios.
-    ranks : (m,), optional
-        Number of modes at each pole, one by default.
     monitor : callable, optional
         ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
-    first = _first(test, omega, ratios, np.ones(omega.size, int) if ranks is None else ranks)
+    first = _first(test, omega, ratios)
     model = RecordModel(test, first.modes.omega.size)
     return _fit(model, first, None, monitor or (lambda i, r: None), ROUGH)
 
@@ -316,26 +307,17 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def ranks_of(test: Measurement, omega: Array, ratios: Array) -> NDArray[np.intp]:
-    """Number of modes at each pole that stand out of noise: the rank of its residue, (m,)."""
-    records = Records(test)
-    free = records.fit(omega, ratios)
-    return free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)
-
-
-def _first(test: Measurement, omega: Array, ratios: Array, ranks: NDArray[np.intp]) -> Parameters:
-    """Rank-one modes nearest to free residues, so many at each pole; with a force, its masses."""
+def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
+    """Rank-one modes nearest to free residues at given poles; with a force, its masses."""
     records = Records(test)
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
     size[size == 0] = size.max()  # a base direction that does not move: any scale will do
     u, s, vt = np.linalg.svd(residues * size)
-    pole = np.repeat(np.arange(omega.size), ranks)
-    at = np.concatenate([np.arange(rank) for rank in ranks])
-    strength = np.sqrt(s[pole, at] / size[:d].max())
-    phi, push = u[pole, :, at].T * strength, vt[pole, at] * (s[pole, at] / strength)[:, None] / size
-    modes, ends = Modes(phi, push[:, :d], omega[pole], ratios[pole]), push[:, d:]
+    strength = np.sqrt(s[:, 0] / size[:d].max())
+    phi, push = u[:, :, 0].T * strength, vt[:, 0] * (s[:, 0] / strength)[:, None] / size
+    modes, ends = Modes(phi, push[:, :d], omega, ratios), push[:, d:]
     rigid: Array = np.zeros((d, d))
     if test.force is not None:
         t, rigid = weigh(test, modes, ends)
