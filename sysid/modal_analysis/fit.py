@@ -27,7 +27,7 @@ from sysid.modal_analysis.record_fit import (
     without,
 )
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import PROMISING, least_worth, no_modes, with_further_modes
+from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
@@ -116,29 +116,12 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
 
 
 def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
-    """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
+    """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors."""
     monitor.doing = f"{poles.omega.size} modes"
-    first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
-    fit = _kept(_pruned(first, monitor, limits=ROUGH), monitor)
+    fit = _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
+    fit = _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
-    monitor.doing = "several modes at a pole"
-    repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
-    if repeated.model.m == first.model.m:
-        return fit
-    repeated = _pruned(repeated, monitor, limits=ROUGH)
-    if not _worth_more(repeated, fit, PROMISING):
-        return fit
-    repeated = _kept(repeated, monitor)
-    if not _worth_more(repeated, fit):
-        return fit
-    monitor.keep(repeated)
-    return repeated
-
-
-def _worth_more(fit: RecordFit, other: RecordFit, share: float = 1.0) -> bool:
-    """True where a fit explains more than another by a share of what its further modes must be worth."""
-    more = max(fit.model.m - other.model.m, 0)
-    return fit.likelihood - other.likelihood > share * more * least_worth(other.model)
+    return fit
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
@@ -149,12 +132,7 @@ def _same_modes(modes: Modes, poles: Poles) -> bool:
     return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
 
 
-def _kept(fit: RecordFit, monitor: FitMonitor | None) -> RecordFit:
-    """A rough fit settled, and without the modes that noise explains then."""
-    return _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
-
-
-def _pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
+def _pruned(fit: RecordFit, monitor: FitMonitor, *, limits: Limits = WHOLE) -> RecordFit:
     """The fit without modes that noise explains, several together where noise explains them all."""
     while np.any(least := _least(fit)):
         fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)

@@ -176,12 +176,8 @@ class RecordFit:
         return fit
 
 
-def record_modes(
-    test: Measurement, omega: Array, ratios: Array, *, repeated: bool = False, monitor: FitMonitor | None = None
-) -> RecordFit:
+def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: FitMonitor | None = None) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
-
-    At each pole there is one mode, or, with `repeated`, as many as its residue has rank.
 
     Parameters
     ----------
@@ -192,7 +188,7 @@ def record_modes(
     monitor : FitMonitor, optional
         Called with iterations and ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
-    first = _first(test, omega, ratios, repeated=repeated)
+    first = _first(test, omega, ratios)
     model = RecordModel(test, first.modes.omega.size)
     return _fit(model, first, None, monitor or FitMonitor(), ROUGH)
 
@@ -353,22 +349,17 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _first(test: Measurement, omega: Array, ratios: Array, *, repeated: bool) -> Parameters:
-    """Rank-one modes nearest to free residues at given poles, one at each or `repeated`; with a force, its masses."""
+def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
+    """Rank-one modes nearest to free residues at given poles; with a force, its masses."""
     records = Records(test)
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
     size[size == 0] = size.max()  # a base direction that does not move: any scale will do
     u, s, vt = np.linalg.svd(residues * size)
-    ranks = np.ones(omega.size, int)
-    if repeated:
-        ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, d)
-    pole = np.repeat(np.arange(omega.size), ranks)
-    at = np.concatenate([np.arange(rank) for rank in ranks])
-    strength = np.sqrt(s[pole, at] / size[:d].max())
-    phi, push = u[pole, :, at].T * strength, vt[pole, at] * (s[pole, at] / strength)[:, None] / size
-    modes, ends = Modes(phi, push[:, :d], omega[pole], ratios[pole]), push[:, d:]
+    strength = np.sqrt(s[:, 0] / size[:d].max())
+    phi, push = u[:, :, 0].T * strength, vt[:, 0] * (s[:, 0] / strength)[:, None] / size
+    modes, ends = Modes(phi, push[:, :d], omega, ratios), push[:, d:]
     rigid: Array = np.zeros((d, d))
     if test.force is not None:
         t, rigid = weigh(test, modes, ends)

@@ -27,7 +27,7 @@ _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
 _AT_ONCE = 16  # trial poles
 _APART = 10.0  # half half-power widths between further modes that are tried together
-PROMISING = 0.7  # of what a mode must be worth, that a few steps show
+_PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
 def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
@@ -57,13 +57,13 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
         more = refitted(fit, p, limits=ROUGH, some=some, monitor=monitor)
         poor = no_modes(more)
         if p.modes.omega.size > m + 1:
-            poor |= worth(more) < PROMISING * least
+            poor |= worth(more) < _PROMISING * least
         poor[:m] = False
         if not np.any(poor):
             break
         p = without(more, poor)
     added = p.modes.omega.size - m
-    if added == 0 or more.likelihood - fit.likelihood < PROMISING * added * least or np.any(no_modes(more)):
+    if added == 0 or more.likelihood - fit.likelihood < _PROMISING * added * least or np.any(no_modes(more)):
         return None
     more = refitted(more, more.parameters, limits=TRIAL, some=some, monitor=monitor)
     if not more.settled or more.likelihood - fit.likelihood < added * least:
