@@ -12,7 +12,7 @@ from sysid.cli.output import Output
 from sysid.jobs.job import JobResult
 from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
-from sysid.results.summary import counted
+from sysid.results.tables import counted
 
 _LARGER = (
     "draws have the noise under which least squares scatter as Huber's loss does on the records: it is some per cent\n"

@@ -23,7 +23,7 @@ from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
-from sysid.results.summary import counted
+from sysid.results.tables import counted
 from sysid.structure.thresholds import EXACT
 
 

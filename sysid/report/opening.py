@@ -9,10 +9,9 @@ import numpy as np
 from sysid.report.html import bullets, escaped, number, paragraph, sentence, table
 from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
-from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
-from sysid.results.summary import FIRST, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
-from sysid.results.unknowns_table import unknown_rows
+from sysid.results.summary import FIRST, JUDGEMENTS, fitted_in_words, next_steps, verdict
+from sysid.results.tables import counted, deck_masses, half_width, unknown_rows
 from sysid.structure.thresholds import LIKELY
 
 _COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}

@@ -20,10 +20,9 @@ from sysid.problem.stated import StatedProblem
 from sysid.problem.stored import NotRebuiltError, needs_module
 from sysid.results import readings, storage
 from sysid.results.answer import Answer
-from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import noise_of_channels
 from sysid.results.records import PartOfProblem, StoredRecords
 from sysid.results.summary import summary
+from sysid.results.tables import gains_of_sensors, noise_of_channels
 from sysid.results.version import __version__
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, Structure
