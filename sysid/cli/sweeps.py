@@ -205,7 +205,7 @@ def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
         notes += ["predicted: relative residual of what was left out, where the rest tells its motion"] * predicted
         notes += [
             "farthest: of frequencies, damping ratios and unknowns, the step from the first row that is largest in the "
-            "standard deviations (std) that it has by noise alone",
+            "standard deviations (std) that it has by noise alone"
         ]
     else:
         notes[0] += "; worse: another one fits better, by AIC and BIC decisively"

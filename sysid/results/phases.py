@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
-from sysid.search.strategy import Phase
+from sysid.problem.prepared import Prepared
+from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
-
-if TYPE_CHECKING:
-    from sysid.results.answer import Answer
 
 COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
 
@@ -22,7 +20,27 @@ def seconds_in_words(seconds: float) -> str:
     return f"{seconds:.2g} s" if not seconds >= 99.5 else f"{seconds:.0f} s"
 
 
-def rows_of_phases(it: Answer) -> list[list[str]]:
+class Searched(Protocol):
+    """A result, as far as its phases go."""
+
+    @property
+    def prepared(self) -> Prepared:
+        """The problem that was identified."""
+
+    @property
+    def history(self) -> History:
+        """The history of its search."""
+
+    @property
+    def structure(self) -> Structure:
+        """The answer."""
+
+    @property
+    def x(self) -> Array | None:
+        """Its unknowns."""
+
+
+def rows_of_phases(it: Searched) -> list[list[str]]:
     """A row of `COLUMNS` for each phase of the search that gave the answer; the truth's columns "-" without one.
 
     Frequencies: largest relative error; MAC: of the mode that is told least; M_SS, K_SS and C: relative error in
@@ -54,7 +72,7 @@ def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
     return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
 
 
-def _row(it: Answer, phase: Phase) -> list[str]:
+def _row(it: Searched, phase: Phase) -> list[str]:
     problem, truth = it.prepared, it.prepared.stated.reference
     # The graph of the matrices, which a hundred sensors cannot wait for, is not built for the answer itself.
     answered = it.x is not None and np.array_equal(phase.x, it.x)
