@@ -22,7 +22,7 @@ _LARGER = (
 
 def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
-    from sysid.plot.draws import draws as picture
+    from sysid.plot.refinement import draws as picture
 
     names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     each: list[Sequence[object]] = [names]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import importlib
 import signal
 import sys
 import tempfile
@@ -23,8 +24,7 @@ from typing import IO, NoReturn, cast, get_args
 
 from sysid import catalogue
 from sysid.cli import doctor, export, parameters, read, starting, stored_result, trust, unfinished
-from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
-from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
+from sysid.cli.command_parser import JSON, QUIET, Parser, adder, band, count, epilog, orders, seconds, seed, whole
 from sysid.cli.display import display_on
 from sysid.cli.files import alone_in, replaced_in_words, save, summary_and_figures, write_pages
 from sysid.cli.output import Output, collected_warnings, keep_for_document
@@ -212,16 +212,9 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
 
 
-def _compare(options: argparse.Namespace, out: Output) -> int:
-    from sysid.cli import compare
-
-    return compare.run(options, out)
-
-
-def _refine(options: argparse.Namespace, out: Output) -> int:
-    from sysid.cli import refine
-
-    return refine.run(options, out)
+def _later(module: str) -> Callable[[argparse.Namespace, Output], int]:
+    """The command of a module of this folder, which is imported when it runs."""
+    return lambda options, out: int(importlib.import_module(f"sysid.cli.{module}").run(options, out))
 
 
 def _report(options: argparse.Namespace, out: Output) -> int:
@@ -375,7 +368,7 @@ def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
         help="folder of the picture, results/NAME by default; the table goes there too (CSV, JSON)",
     )
     compare.add_argument("--max-time", type=seconds, metavar="S", help="end each method after about so many seconds")
-    compare.set_defaults(command=_compare)
+    compare.set_defaults(command=_later("compare"))
 
 
 def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -436,7 +429,7 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     refine.add_argument("--workers", type=count, metavar="N", help="processes, as many as processors by default")
     refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
-    refine.set_defaults(command=_refine)
+    refine.set_defaults(command=_later("refine"))
 
 
 # -- files --------------------------------------------------------------------------------------

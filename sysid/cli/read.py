@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sysid.cli.argument_types import band
+from sysid.cli.command_parser import band
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.errors import InputError, refuse

@@ -163,7 +163,7 @@ def _write(
     folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
 ) -> None:
     """Write the ends of all starts as CSV, and the picture."""
-    from sysid.plot.minima import minima as picture
+    from sysid.plot.refinement import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
     names = ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)

@@ -134,7 +134,7 @@ def report_sweep(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
-    from sysid.plot.sweep import sweep as picture
+    from sysid.plot.refinement import sweep as picture
 
     part = sweep.of_parts
     score = scored(result, np.nan if part else None)

@@ -28,8 +28,7 @@ from sysid.report.html import (
     table,
 )
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
-from sysid.report.noise_level import NoiseLevel, noise_of_test, share_of_noise
-from sysid.report.opening import opening, rounded, trust
+from sysid.report.opening import NoiseLevel, noise_of_test, opening, rounded, share_of_noise, trust
 from sysid.results.identification import Identification
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder

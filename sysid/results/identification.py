@@ -20,7 +20,7 @@ from sysid.problem.stated import StatedProblem
 from sysid.problem.stored import NotRebuiltError, needs_module
 from sysid.results import readings, storage
 from sysid.results.answer import Answer
-from sysid.results.records import PartOfProblem, StoredRecords
+from sysid.results.facts import PartOfProblem, StoredRecords
 from sysid.results.summary import summary
 from sysid.results.tables import gains_of_sensors, noise_of_channels
 from sysid.results.version import __version__
