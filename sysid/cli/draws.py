@@ -12,7 +12,7 @@ from sysid.cli.output import Output
 from sysid.jobs.job import JobResult
 from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
-from sysid.results.summary import counted
+from sysid.results.tables import counted
 
 _LARGER = (
     "draws have the noise under which least squares scatter as Huber's loss does on the records: it is some per cent\n"
@@ -22,7 +22,7 @@ _LARGER = (
 
 def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
-    from sysid.plot.draws import draws as picture
+    from sysid.plot.refinement import draws as picture
 
     names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     each: list[Sequence[object]] = [names]

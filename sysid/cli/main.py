@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import importlib
 import signal
 import sys
 import tempfile
@@ -19,31 +20,25 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NoReturn, cast, get_args
+from typing import IO, NoReturn, cast, get_args
 
 from sysid import catalogue
 from sysid.cli import doctor, export, parameters, read, starting, stored_result, trust, unfinished
-from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
-from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
+from sysid.cli.command_parser import JSON, QUIET, Parser, adder, band, count, epilog, orders, seconds, seed, whole
 from sysid.cli.display import display_on
-from sysid.cli.files import alone_in
-from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
+from sysid.cli.files import alone_in, replaced_in_words, save, summary_and_figures, write_pages
+from sysid.cli.output import Output, collected_warnings, keep_for_document
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
 from sysid.results.checkpoint import FILE_NAME as UNFINISHED
 from sysid.results.checkpoint import Checkpoint
-from sysid.results.identification import Identification
-from sysid.results.storage import FILE_NAME as RESULT
-from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
 from sysid.search.auto import NAMED
-from sysid.search.deadline import TimeIsOver, within
 from sysid.search.refinement import RefineBy
 from sysid.search.session import GRACE, DeferredInterrupt
 
 _LOG = "sysid-error.log"
-_SUMMARY = "summary.json"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -139,6 +134,8 @@ def _new(options: argparse.Namespace, out: Output) -> int:
 def _show(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli.show import figures, show
 
+    if read.is_test(options.problem):
+        return stored_result.tell(options, out)
     recipe = parameters.recipe_of(options, out, options.seed)
     problem = catalogue.build(recipe)
     if out.json:
@@ -188,20 +185,23 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
                 checkpoint=checkpoint,
             )  # fmt: skip
         result = replace(result, recipe=recipe)
+        replaced = replaced_in_words(result, folder)
         try:
-            _save(result, folder, checkpoint)
+            save(result, folder, checkpoint)
         except InputError as error:
             failed = error
     try:
-        words, figures = _summary_and_figures(result, left(GRACE))
-        out.write(f"\n{words}\n\n")
+        words, figures = summary_and_figures(result, left(GRACE))
+        out.write(f"\n{words}\n\n{replaced}")
         out.answer(result=figures)
+        if out.quiet and not result.success:
+            out.warn(f"no fit: {result.undetermined[0]}")
         out.flush()
         if failed is not None:
             raise failed
         # Raised while matplotlib's objects are collected it would be lost, with a traceback.
         with DeferredInterrupt() as writing:
-            _write_pages(result, figures, folder, out, left(0.0))
+            write_pages(result, figures, folder, out, left(0.0))
     except KeyboardInterrupt:
         out.complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
@@ -212,16 +212,9 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
 
 
-def _compare(options: argparse.Namespace, out: Output) -> int:
-    from sysid.cli import compare
-
-    return compare.run(options, out)
-
-
-def _refine(options: argparse.Namespace, out: Output) -> int:
-    from sysid.cli import refine
-
-    return refine.run(options, out)
+def _later(module: str) -> Callable[[argparse.Namespace, Output], int]:
+    """The command of a module of this folder, which is imported when it runs."""
+    return lambda options, out: int(importlib.import_module(f"sysid.cli.{module}").run(options, out))
 
 
 def _report(options: argparse.Namespace, out: Output) -> int:
@@ -271,7 +264,8 @@ def _parser() -> argparse.ArgumentParser:
         "show",
         summary="tell the unknowns of a problem and what its data determine, without a search",
         description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
-        "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess.",
+        "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess. Of a result.h5 "
+        "its summary, of a test that 'sysid read' wrote its channels.",
         examples=("sysid show shear_building", "sysid show my_building.py"),
     )
     parameters.add_arguments(show)
@@ -374,7 +368,7 @@ def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
         help="folder of the picture, results/NAME by default; the table goes there too (CSV, JSON)",
     )
     compare.add_argument("--max-time", type=seconds, metavar="S", help="end each method after about so many seconds")
-    compare.set_defaults(command=_compare)
+    compare.set_defaults(command=_later("compare"))
 
 
 def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -435,58 +429,10 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     refine.add_argument("--workers", type=count, metavar="N", help="processes, as many as processors by default")
     refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
-    refine.set_defaults(command=_refine)
+    refine.set_defaults(command=_later("refine"))
 
 
 # -- files --------------------------------------------------------------------------------------
-
-
-def _save(result: Identification, folder: Path, checkpoint: Checkpoint) -> None:
-    """Write a result, then take away what it replaces."""
-    from sysid.report import report
-
-    missing = missing_folders(folder)
-    try:
-        result.save(folder / RESULT)
-        for name in (_SUMMARY, report.FILE_NAME):  # those of another result must not stand beside this one
-            (folder / name).unlink(missing_ok=True)
-        if not result.interrupted:
-            checkpoint.remove()
-    except OSError as error:
-        raise InputError(f"folder of results {folder}: {error.strerror or error}") from error
-    finally:
-        remove_empty(missing)  # where nothing could be written
-
-
-def _summary_and_figures(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
-    """Summary and figures of a result; without what takes more than the seconds that are `left`."""
-    try:
-        with within(left):
-            return result.summary(), result.to_dict()
-    except TimeIsOver:
-        hurried = replace(result, hurried=True)
-        return hurried.summary(), hurried.to_dict()
-
-
-def _write_pages(
-    result: Identification, figures: dict[str, Any], folder: Path, out: Output, left: float | None
-) -> None:
-    """Write what people and scripts read of a result that is saved, each file whole or not at all.
-
-    The page is left out where it takes more than the seconds that are `left`.
-    """
-    from sysid.report import report
-
-    out.wrote(folder / RESULT, "result   ")
-    summary = folder / _SUMMARY
-    with atomically(summary) as temporary:
-        temporary.write_text(strict_json(figures), encoding="utf-8")
-    out.wrote(summary, "summary  ")
-    try:
-        with within(left):
-            out.wrote(report.write_report(result, folder / report.FILE_NAME), "report   ")
-    except TimeIsOver:
-        out.write(f"no report, as the time is over: 'sysid report {folder}' writes it\n")
 
 
 def _write_log() -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sysid.cli.argument_types import band
+from sysid.cli.command_parser import band
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.errors import InputError, refuse
@@ -76,11 +76,16 @@ def run(options: argparse.Namespace, out: Output) -> int:
     test = gather(options.files, _said(options))
     with atomically(target) as temporary:
         temporary.write_bytes(test.to_bytes())
-    out.write(f"{test.in_words()}\n")
+    tell_channels(test, out)
     out.wrote(target)
     out.write(f"'sysid run {target}' identifies it\n")
-    out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
     return SUCCESS
+
+
+def tell_channels(test: recorded_test.RecordedTest, out: Output) -> None:
+    """Write the channels of a test and what was noticed while it was read."""
+    out.write(f"{test.in_words()}\n")
+    out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
 
 
 def _said(options: argparse.Namespace) -> Any:

@@ -23,7 +23,7 @@ from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
-from sysid.results.summary import counted
+from sysid.results.tables import counted
 from sysid.structure.thresholds import EXACT
 
 
@@ -163,7 +163,7 @@ def _write(
     folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
 ) -> None:
     """Write the ends of all starts as CSV, and the picture."""
-    from sysid.plot.minima import minima as picture
+    from sysid.plot.refinement import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
     names = ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)

@@ -27,7 +27,8 @@ from sysid.problem.feasibility import HELD, LOOSE, points_of
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
-from sysid.results.summary import WIDTH, counted
+from sysid.results.summary import WIDTH
+from sysid.results.tables import counted, in_columns
 from sysid.search.auto import choose
 from sysid.search.continuation import DRAWN
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -427,11 +428,9 @@ def _range(values: Array) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines of a table, every column as wide as its longest cell."""
+    """Lines of a table, each cell in one line."""
     cells = [[" ".join(cell.split()) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+    return (f"  {line}" for line in in_columns(cells, range(len(cells[0]))))
 
 
 def _folded(line: str) -> str:

@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.cli import trust
+from sysid.cli import read, trust
 from sysid.cli.output import Output
-from sysid.errors import InputError
+from sysid.cli.status import SUCCESS
+from sysid.errors import InputError, refuse
+from sysid.files import recorded_test
 from sysid.results.identification import Identification, Recipe, load
 
 
@@ -46,3 +48,21 @@ def with_problem_of(result: Identification, recipe: Recipe, source: str | Path) 
         return result.with_problem(problem)
     except InputError as error:
         raise InputError(f"{source}, with {recipe.title}: {error}") from error
+
+
+def tell(options: argparse.Namespace, out: Output) -> int:
+    """Write the summary of a stored result, or the channels of a test that ``sysid read`` wrote; the exit status."""
+    file = options.problem
+    refuse(
+        (
+            options.settings or options.data or options.seed is not None,
+            f"{file}: --set, --data and --seed are for problems",
+        )
+    )
+    if recorded_test.is_recorded_test(file):
+        read.tell_channels(recorded_test.load(file), out)
+    else:
+        result = load(file)
+        out.write(f"{result.summary()}\n")
+        out.answer(result=result.to_dict())
+    return SUCCESS

@@ -22,6 +22,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe
 from sysid.results.summary import WIDTH
+from sysid.results.tables import in_columns
 from sysid.search.modal import poles_of
 from sysid.structure.thresholds import FALSE_ALARM, most_deviations
 
@@ -133,7 +134,7 @@ def report_sweep(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
-    from sysid.plot.sweep import sweep as picture
+    from sysid.plot.refinement import sweep as picture
 
     part = sweep.of_parts
     score = scored(result, np.nan if part else None)
@@ -167,12 +168,7 @@ def comparison_table(rows: Sequence[Compared], part: bool) -> str:
         for name, values in criteria(rows).items():
             columns.append((name, [_number(value, ".1f") for value in values]))
     columns.append(("farthest", [_farthest(row.moves) for row in rows]))
-    cells = [[head, *column] for head, column in columns]
-    widths = [max(map(len, column)) for column in cells]
-    lines = []
-    for first, *others, last in zip(*cells, strict=True):
-        middle = "  ".join(f"{cell:>{width}}" for cell, width in zip(others, widths[1:-1], strict=True))
-        lines.append(f"{first:{widths[0]}}  {middle}  {last}".rstrip())
+    lines = in_columns(zip(*([head, *column] for head, column in columns), strict=True), (0, -1))
     return "\n".join([*lines, *_notes(rows, part)])
 
 
@@ -209,7 +205,7 @@ def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
         notes += ["predicted: relative residual of what was left out, where the rest tells its motion"] * predicted
         notes += [
             "farthest: of frequencies, damping ratios and unknowns, the step from the first row that is largest in the "
-            "standard deviations (std) that it has by noise alone",
+            "standard deviations (std) that it has by noise alone"
         ]
     else:
         notes[0] += "; worse: another one fits better, by AIC and BIC decisively"

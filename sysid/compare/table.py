@@ -13,6 +13,7 @@ from sysid.compare.comparison import Comparison
 from sysid.compare.method_result import MATRICES, MethodResult, Status
 from sysid.results.phases import seconds_in_words
 from sysid.results.summary import WIDTH
+from sysid.results.tables import in_columns
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -28,15 +29,8 @@ def comparison_text(comparison: Comparison) -> str:
         ("seconds", [_number(result.seconds, ".2f") for result in results]),
         ("status", [result.status.value for result in results]),
     ]
-    cells = [[head, *column] for head, column in columns]
-    widths = [max(map(len, column)) for column in cells]
-    lines = [
-        f"{row[0]:{widths[0]}}  "
-        + "  ".join(f"{cell:>{width}}" for cell, width in zip(row[1:-1], widths[1:-1], strict=True))
-        + f"  {row[-1]}"
-        for row in zip(*cells, strict=True)
-    ]
-    return "\n".join([*lines, *_notes(comparison)])
+    rows = zip(*([head, *column] for head, column in columns), strict=True)
+    return "\n".join([*in_columns(rows, (0, -1)), *_notes(comparison)])
 
 
 def line(result: MethodResult) -> str:

@@ -162,6 +162,11 @@ class RecordedTest:
                     refuse((shape != (rows, n), f"{name} of a run is {shape}: ({rows}, {n}) is needed"))
 
 
+def is_recorded_test(path: str | Path) -> bool:
+    """True where a file of sysid's holds a test, False where it holds something else; errors as of `load`."""
+    return _tree(Path(path)).get("content") == _CONTENT
+
+
 def load(path: str | Path) -> RecordedTest:
     """Read a ``test.h5`` again.
 
@@ -171,6 +176,18 @@ def load(path: str | Path) -> RecordedTest:
         Where it is missing, damaged, or something else.
     """
     file = Path(path)
+    tree = _tree(file)
+    if tree.get("content") != _CONTENT:
+        raise InputError(f"{file} holds a {tree.get('content', 'result')}, not a test: give what 'sysid read' wrote")
+    try:
+        return RecordedTest.from_tree(tree)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    except Exception as error:  # what is sound HDF5 and no test may lack anything
+        raise InputError(f"{file} holds no whole test ({type(error).__name__}: {error}): write it again") from error
+
+
+def _tree(file: Path) -> dict[str, Any]:
     refuse((file.exists() and not file.is_file(), f"{file} is no file"))
     try:
         image = file.read_bytes()
@@ -184,11 +201,4 @@ def load(path: str | Path) -> RecordedTest:
         tree, _ = from_bytes(image)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    if tree.get("content") != _CONTENT:
-        raise InputError(f"{file} holds a {tree.get('content', 'result')}, not a test: give what 'sysid read' wrote")
-    try:
-        return RecordedTest.from_tree(tree)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from error
-    except Exception as error:  # what is sound HDF5 and no test may lack anything
-        raise InputError(f"{file} holds no whole test ({type(error).__name__}: {error}): write it again") from error
+    return tree

@@ -10,11 +10,11 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.assessment.sensitivity import sensitivity
-from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.measurement.noise import raised
 from sysid.modal_analysis import outliers
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.results.identification import Identification
+from sysid.results.tables import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.jobs.job import JobResult
-from sysid.jobs.quantities import labelled, quantities
 from sysid.results.identification import Identification
+from sysid.results.tables import labelled, quantities
 from sysid.structure.thresholds import LIKELY
 
 

@@ -8,7 +8,6 @@ Measured is thin and dark, identified dashed and coloured above it, their differ
 """
 
 from sysid.plot.comparison import comparison
-from sysid.plot.minima import minima
 from sysid.plot.plots import (
     base_force,
     base_forces,
@@ -23,6 +22,7 @@ from sysid.plot.plots import (
     stabilisation,
     transmissibility,
 )
+from sysid.plot.refinement import minima
 
 __all__ = [
     "base_force",

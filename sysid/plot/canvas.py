@@ -28,17 +28,17 @@ INK, FAINT, GRID = "#3c4450", "#8a94a0", "#e4e8ec"
 
 def to_png(figure: Figure, *, dpi: float = 100, colours: int | None = None) -> bytes:
     """PNG of a figure; with `colours`, in a palette of so many, which is a third of the size."""
-    return png(_drawn(figure, dpi), dpi, colours)
+    return _png(_drawn(figure, dpi), dpi, colours)
 
 
 def heat_map(values: Array, colours: str, low: float) -> bytes:
     """PNG of a matrix, a pixel an entry, in one of Matplotlib's colour maps from `low` to 1."""
     from matplotlib import colormaps
 
-    return png(colormaps[colours]((values - low) / (1 - low), bytes=True)[..., :3])
+    return _png(colormaps[colours]((values - low) / (1 - low), bytes=True)[..., :3])
 
 
-def png(pixels: NDArray[np.uint8], dpi: float = 100, colours: int | None = None) -> bytes:
+def _png(pixels: NDArray[np.uint8], dpi: float = 100, colours: int | None = None) -> bytes:
     """PNG of pixels (rows, columns, 3), in a palette of so many colours if that is given."""
     from PIL import Image  # matplotlib's own dependency
 

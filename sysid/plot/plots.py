@@ -42,7 +42,7 @@ from sysid.plot.panels import (
     with_force,
 )  # fmt: skip
 from sysid.results.identification import Identification
-from sysid.results.summary import counted
+from sysid.results.tables import counted
 from sysid.structure.structure import Array
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import escaped
-from sysid.report.noise_level import NoiseLevel
+from sysid.report.opening import NoiseLevel
 from sysid.report.still import ChannelSpectra, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray

@@ -10,7 +10,7 @@ from sysid.assessment.sensitivity import system_matrices
 from sysid.plot.plots import normalised
 from sysid.report.html import heat_maps, matrix, no_lines, number, paragraph
 from sysid.results.identification import Identification
-from sysid.results.summary import half_width
+from sysid.results.tables import half_width
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 

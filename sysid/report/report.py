@@ -28,26 +28,26 @@ from sysid.report.html import (
     table,
 )
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
-from sysid.report.noise_level import NoiseLevel, noise_of_test, share_of_noise
-from sysid.report.opening import opening, rounded, trust
-from sysid.results.gain_table import gains_of_sensors
+from sysid.report.opening import NoiseLevel, noise_of_test, opening, rounded, share_of_noise, trust
 from sysid.results.identification import Identification
-from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
-from sysid.results.summary import (
-    JUDGEMENTS,
+from sysid.results.summary import JUDGEMENTS, residual_in_words
+from sysid.results.tables import (
+    NOISE_COLUMNS,
     counted,
+    gains_of_sensors,
     half_width,
     is_one_of_many,
     known_half_width,
     mass_percent_std,
     missing_mass,
+    noise_of_channels,
     noise_source,
-    residual_in_words,
+    stated_values,
     tilde,
+    unknown_rows,
 )  # fmt: skip
-from sysid.results.unknowns_table import stated_values, unknown_rows
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF

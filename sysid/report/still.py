@@ -80,17 +80,6 @@ class _Panel(NamedTuple):
     decades: int
 
 
-class _Line(NamedTuple):
-    """A curve in pixels, (n_freq,), NaN where there is none, interrupted where it jumps by more than `jump`.
-
-    In each column of so many steps the lowest and the highest point are drawn.
-    """
-
-    y: Array
-    jump: float
-    column: int
-
-
 def curve_sheet(name: str, freq: Array, channel: ChannelSpectra, run: int, gaps: ArrayLike = ()) -> str:
     """One channel in one run: magnitude, phase, and what is left of it beside its noise.
 
@@ -241,16 +230,19 @@ def _log_ticks(low: float, high: float, room: float) -> list[float]:
     return [value for value in numbers if low <= value <= high]
 
 
-def _lines(panel: _Panel, up: _Axis) -> Iterator[_Line]:
-    """The curves of a panel in pixels."""
+def _lines(panel: _Panel, up: _Axis) -> Iterator[tuple[Array, float, int]]:
+    """Curves of a panel in pixels, (n_freq,), NaN where there is none; the jump that interrupts each; steps a column.
+
+    In each column the lowest and the highest point are drawn.
+    """
     jump = np.inf if panel.decades else abs(up.start - up.end) / 2
     for kind, values in panel.curves.items():
         seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
         # Of a difference, which is noise, the least and the largest in four steps are drawn.
-        yield _Line(up(seen), jump, 4 if kind == "left" else 1)
+        yield up(seen), jump, 4 if kind == "left" else 1
 
 
-def _paths(x: Array, lines: Sequence[_Line], gaps: ArrayLike, rounds: int = 3) -> list[str]:
+def _paths(x: Array, lines: Sequence[tuple[Array, float, int]], gaps: ArrayLike, rounds: int = 3) -> list[str]:
     """Curves over the same `x` (n_freq,) as paths in steps of part of a pixel, interrupted at `gaps`.
 
     All are thinned at once, as a page has hundreds; in each round they lose points that they do not need, and stay

@@ -32,7 +32,7 @@ from sysid.models.unknowns import by_name
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
-from sysid.results.records import PartOfProblem, StoredRecords
+from sysid.results.facts import PartOfProblem, StoredRecords
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
 

@@ -1,19 +1,22 @@
-"""Facts of a problem beside its records that summary, report and export ask for, and that files can hold."""
+"""Records of a problem, and facts beside them that summary, report and export ask for: what its file always holds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sysid.assessment.checks.gains import taken_at_sensors
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.given import MATRICES
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest
-from sysid.structure.structure import Array
+from sysid.structure.structure import Array, Structure
 
 _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
 
@@ -162,3 +165,51 @@ def _stated_rigid_body(problem: Prepared) -> Array:
     if totals is None or totals.kind != "rigid_body":
         return np.zeros((d, d), dtype=bool)
     return np.ones((d, d), dtype=bool) if totals.values.ndim == 2 else np.eye(d, dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRecords:
+    """The records of a problem without its matrices; the attributes are those of `Problem`."""
+
+    measurement: Measurement
+    reference: Structure | None
+    validation: tuple[Measurement, ...]
+    goal: float | None
+    loss: str
+    fit: RecordFit | None
+    """Of whole records, which the file holds."""
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
+        """Give the records of a tree that `Problem.to_tree` made."""
+        test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
+        return cls(
+            test,
+            None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
+            tuple(Measurement.from_tree(test) for test in tree["validation"]),
+            tree["goal"],
+            tree["loss"],
+            None if fits[0] is None else RecordFit.from_tree(fits[0], test),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PartOfProblem:
+    """Part of a problem in a file that does not hold it whole.
+
+    Attributes
+    ----------
+    tree, readings : dict
+        What `Problem.to_tree` and `sysid.results.readings` made.
+    records : Records
+    attributes : dict
+        All that readers of the result ask of the problem: attributes of `Answer` by their names.
+    without : str
+        Why the problem cannot be made of it, for a message.
+    """
+
+    tree: dict[str, Any]
+    readings: dict[str, Any]
+    records: StoredRecords
+    attributes: dict[str, Any]
+    without: str

@@ -21,10 +21,9 @@ from sysid.problem.stated import StatedProblem
 from sysid.problem.stored import NotRebuiltError, needs_module
 from sysid.results import readings, storage
 from sysid.results.answer import Answer
-from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import noise_of_channels
-from sysid.results.records import PartOfProblem, StoredRecords
+from sysid.results.facts import PartOfProblem, StoredRecords
 from sysid.results.summary import summary
+from sysid.results.tables import gains_of_sensors, noise_of_channels
 from sysid.results.version import __version__
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, Structure
@@ -192,12 +191,7 @@ class Identification(Answer):
                 for c in noise_of_channels(self)
             ],
             "gains": [
-                {
-                    "sensor": g.sensor,
-                    "gain": g.gain,
-                    "std": g.std,
-                    "deviations_per_percent": _plain(np.array(g.worth)),
-                }
+                {"sensor": g.sensor, "gain": g.gain, "std": g.std, "deviations_per_percent": _plain(np.array(g.worth))}
                 for g in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),

@@ -6,19 +6,31 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import system_matrices
 from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
 from sysid.results.answer import Answer
-from sysid.results.deck_masses import deck_masses
-from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
-from sysid.results.unknowns_table import MANY, stated_values, unknown_rows
-from sysid.structure.structure import Array
-from sysid.structure.thresholds import LIKELY, ROUND_OFF, UNEXPLAINED
+from sysid.results.tables import (
+    MANY,
+    NOISE_COLUMNS,
+    counted,
+    deck_masses,
+    gains_of_sensors,
+    half_width,
+    in_columns,
+    is_one_of_many,
+    known_half_width,
+    mass_percent_std,
+    missing_mass,
+    noise_of_channels,
+    noise_source,
+    stated_values,
+    tilde,
+    unknown_rows,
+)  # fmt: skip
+from sysid.structure.thresholds import UNEXPLAINED
 
 _SCALE = (
     "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
@@ -38,7 +50,6 @@ _AS_STATED = ". No force was measured: they are as right as the mass or stiffnes
 WIDTH = 120  # letters in a line
 FIRST = 2  # sentences beside the verdict; the others follow the tables
 _FORCE = 3.0  # times the residual of the accelerations, from which that of the force is the larger concern
-_MISSING = 0.5  # % of the rigid-body mass
 _OF_A_FIT = ", which holds for a model that fits: this one does not"
 
 
@@ -88,14 +99,14 @@ def summary(it: Answer) -> str:
 def _phases(it: Answer) -> list[str]:
     """Table of what each phase left, where there was more than one."""
     rows = it.phases
-    return _aligned([list(column) for column in zip(COLUMNS, *rows, strict=True)]) if len(rows) > 1 else []
+    return in_columns([COLUMNS, *rows]) if len(rows) > 1 else []
 
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
     rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
     head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
-    return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
+    return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
 
 
 def _gains(it: Answer) -> list[str]:
@@ -105,13 +116,7 @@ def _gains(it: Answer) -> list[str]:
         for g in gains_of_sensors(it)
     ]
     head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")
-    return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
-
-
-def noise_source(it: Answer) -> str:
-    """Source of the levels of noise, in words: stated or found."""
-    whole = it.records.measurement.whole
-    return "as stated" if whole is not None and whole.noise is not None else "found with the fit"
+    return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
 
 
 def residual_in_words(it: Answer) -> str:
@@ -197,42 +202,6 @@ def _towards_a_fit(it: Answer) -> list[str]:
     return [*steps, f"if a fit as near as this one will do, say so: goal={enough} (sysid run test.h5 --goal {enough})"]
 
 
-def half_width(std: float, value: float) -> str:
-    """Half of the 95 % interval about `value`; "open" where it is not known, 0 where it is round-off."""
-    if not np.isfinite(std):
-        return "open"
-    return f"{LIKELY * std:.2g}" if std > ROUND_OFF * abs(value) else "0"
-
-
-def known_half_width(std: float, value: float, sign: str) -> str:
-    """`half_width` after a sign; empty where it is not known or round-off."""
-    width = half_width(std, value)
-    return "" if width in ("open", "0") else f"{sign} {width}"
-
-
-def tilde(many: ArrayLike) -> str:
-    """The mark of a value that is one of many."""
-    return "~" if np.any(many) else ""
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things: "1 run", "2 runs"."""
-    return f"{number} {what}" + "s" * (number != 1)
-
-
-def mass_percent_std(it: Answer) -> Array:
-    """Standard deviations of `Structure.effective_mass_percent`, (n, d); NaN where open or not computed."""
-    rigid = np.diag(it.structure.rigid_body_mass)
-    return 100 * np.einsum("kii->ki", it.quick_std("effective_masses")) / np.where(rigid > 0, rigid, np.inf)
-
-
-def is_one_of_many(it: Answer) -> Array:
-    """Which effective masses are one choice among many, (n, d) of bool; a common factor changes none of a sum."""
-    unit_sum = it.facts.unit_mass and not it.facts.mass_is_free  # nothing in kg beside what is scaled
-    known = it.determined or it.hurried or (unit_sum and it.scale_is_open)
-    return np.logical_and(np.isnan(mass_percent_std(it)), not known)
-
-
 def _mode_table(it: Answer) -> list[str]:
     """Frequencies, damping and effective masses, with half-widths where they are known and there is room."""
     s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
@@ -254,25 +223,13 @@ def _mode_table(it: Answer) -> list[str]:
     ]
     mass_widths = [["+-", *(half_width(value, 100.0) for value in entries), ""] for entries in std.T]
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
-    lines = _aligned(columns + both)
+    lines = in_columns(zip(*columns, *both, strict=True))
     if not np.any(np.isfinite(std)) or len(lines[0]) > WIDTH:
-        lines = _aligned(columns + masses)
+        lines = in_columns(zip(*columns, *masses, strict=True))
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
     notes += ["~ one of many values that fit as well"] if many.any() else []
     return [*lines, "; ".join(notes), *missing_mass(it)]
-
-
-def missing_mass(it: Answer) -> list[str]:
-    """Sentence on the rigid-body mass in none of the modes, where it is no round-off of a table."""
-    missing, many = 100 - it.structure.effective_mass_percent.sum(axis=0), np.any(is_one_of_many(it), axis=0)
-    shares = [
-        f"{tilde(one)}{share:.3g} % in {axis}"
-        for axis, share, one in zip(it.measurement.base_axes or (), missing, many, strict=True)
-        if share > _MISSING
-    ]
-    where = "is in none of these modes: it moves with the base, or in modes beyond the lines"
-    return [f"of the rigid-body mass, {', '.join(shares)} {where}"] * bool(shares)
 
 
 def _deck_masses(it: Answer) -> list[str]:
@@ -291,20 +248,13 @@ def _unknowns(it: Answer) -> list[str]:
         return []
     computed = it.quick_uncertainty is not None
     cells = [
-        [row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit] for row in rows
-    ]
-    at = [row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
-    columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *cells, strict=True)]
-    return [*_aligned([*columns, ["search space", *at]]), ""]
-
-
-def _aligned(columns: list[list[str]]) -> list[str]:
-    """Lines of a table, every column as wide as its longest cell."""
-    widths = [max(map(len, column)) for column in columns]
-    return [
-        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in zip(*columns, strict=True)
-    ]
+        (
+            row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit,
+            row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}",
+        )
+        for row in rows
+    ]  # fmt: skip
+    return [*in_columns([("unknown", "value", "+- (95 %)", "unit", "search space"), *cells]), ""]
 
 
 def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:

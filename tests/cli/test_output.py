@@ -157,3 +157,32 @@ def test_a_missing_extra_is_one_line_with_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, package, None)
     assert cli.main([str(pair) if word == "RESULT" else word for word in words]) == 2
     assert complaint().endswith(f"needs the package {package}: python -m pip install 'structural-sysid[{extra}]'\n")
+
+
+def test_quiet_tells_a_run_without_a_fit_in_one_line(here, capsys, no_pictures, module):
+    (here / "pair.py").write_text(module.replace("goal=1e-6", "goal=1e-30"))
+    assert cli.main(["run", "pair.py", "--quiet"]) == 1
+    out, error = capsys.readouterr()
+    assert out == "" and error.count("\n") == 1 and "no fit" in error
+
+
+def test_show_prints_the_summary_of_a_result_and_the_channels_of_a_test(here, finished, capsys, document):
+    result, file = sysid.load(finished), finished / "result.h5"
+    assert cli.main(["show", str(file)]) == 0
+    assert capsys.readouterr().out == f"{result.summary()}\n"
+    assert document("show", file)[1]["result"]["residual"] == pytest.approx(result.residual)
+    assert document("show", file, "--set", "floors=3")[0] == 2
+    columns = np.column_stack([np.arange(200) / 50, np.random.default_rng(0).standard_normal((200, 2))])
+    np.savetxt(here / "run.csv", columns, delimiter=",", header="time [s],base [m/s²],top [m/s²]", comments="")
+    sensors = ("--sensor", "base", "role=base", "axis=x", "--sensor", "top", "role=response", "axis=x")
+    read = document("read", "run.csv", *sensors, "--out", "test.h5")[1]
+    assert document("show", "test.h5")[1]["channels"] == read["channels"]
+
+
+def test_a_run_says_that_it_replaces_the_result_of_another_strategy(here, capsys, no_pictures):
+    assert cli.main(["run", "pair.py"]) == 0
+    assert "replaces" not in capsys.readouterr().out
+    summary = here / "results/pair/summary.json"
+    summary.write_text(json.dumps({**json.loads(summary.read_text()), "strategy": "swarm"}))
+    assert cli.main(["run", "pair.py"]) == 0
+    assert "replaces the result of strategy swarm" in capsys.readouterr().out

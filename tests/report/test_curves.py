@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.report.curves import curves
-from sysid.report.noise_level import NoiseLevel, share_of_noise
+from sysid.report.opening import NoiseLevel, share_of_noise
 
 
 def test_every_channel_of_every_test_is_in_its_curves(complete, page):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 import sysid
-from sysid.report.noise_level import noise_of_test, share_of_noise
+from sysid.report.opening import noise_of_test, share_of_noise
 
 FREQ = np.linspace(1.0, 40.0, 2000)
 

@@ -1,4 +1,4 @@
-"""Picture of identifications beside a result: what they leave, and how far their quantities are from its own."""
+"""Pictures of refinement jobs: minima of many starts, draws of noise, identifications beside a result."""
 
 from __future__ import annotations
 
@@ -7,15 +7,90 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sysid.jobs.minima import Minimum
 from sysid.jobs.score import DECISIVE, Compared, Move, Score
+from sysid.jobs.spread import Spread
 from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure, plain_log, positive
-from sysid.structure.thresholds import LIKELY
+from sysid.structure.thresholds import EPSILON, LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_ROW, _MARGIN = 0.28, 1.5  # inches
 _TICKS = (3.0, 10.0, 100.0, 1000.0, 1e4, 1e6)  # standard deviations; to the first the axis is linear
+
+
+def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = None) -> Figure:
+    """The residual of each start, those that ended in one minimum side by side and in one colour.
+
+    Parameters
+    ----------
+    found : sequence of Minimum
+        As `sysid.jobs.minima.distinct` gives them.
+    title : str
+    goal : float, optional
+        Drawn as a line.
+
+    Returns
+    -------
+    Figure
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(7.2, 4.2)
+    ax = figure.subplots()
+    drawn = 0
+    for i, minimum in enumerate(found):
+        left = np.maximum(sorted(result.residual for result in minimum.results), EPSILON)
+        named = i < len(COLOURS)
+        times = f"reached {len(left)} time{'s' if len(left) > 1 else ''}"
+        label = f"{i + 1}: {minimum.residual:.4e}, {times}" if named else "others" if i == len(COLOURS) else None
+        colour = COLOURS[i] if named else FAINT
+        ax.plot(drawn + 1 + np.arange(len(left)), left, "o", color=colour, markersize=5, label=label)
+        drawn += len(left)
+    if goal is not None:
+        ax.axhline(goal, color=FAINT, linewidth=0.9, linestyle="--", label=f"goal {goal:.3g}")
+    ax.set_yscale("log")
+    # Over round-off alone the ticks would all be one number.
+    lowest, highest = ax.dataLim.intervaly
+    ax.set_ylim(lowest / 2, 2 * highest)
+    if highest < 25 * lowest:
+        plain_log(ax.yaxis)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    dress(ax, title, "starts, by minimum", "relative residual [–]")
+    ax.legend(frameon=False, fontsize="small", title="minimum and its residual", title_fontsize="small")
+    return figure
+
+
+def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
+    """A row for each quantity whose linear deviation is known: the ratio, 1 where the linear one is right.
+
+    Parameters
+    ----------
+    found : sequence of Spread
+        As `sysid.jobs.spreads` gives them.
+    count : int
+        Draws that they are of; the bars are what chance alone makes of so many, in 95 %.
+    title : str
+
+    Returns
+    -------
+    Figure
+    """
+    known = [spread for spread in found if np.isfinite(spread.ratio)]
+    figure = new_figure(7.2, 1.3 + 0.22 * len(known))
+    ax = figure.subplots()
+    rows = np.arange(len(known))
+    ratios = [spread.ratio for spread in known]
+    chance = LIKELY / np.sqrt(2 * count)
+    ax.axvspan(1 - chance, 1 + chance, color=FAINT, alpha=0.25, linewidth=0, label=f"chance of {count} draws, 95 %")
+    ax.axvline(1.0, color=FAINT, linewidth=0.9)
+    ax.plot(ratios, rows, "o", color=COLOURS[0], markersize=5)
+    ax.set_yticks(rows, [spread.name for spread in known])
+    ax.set_ylim(len(known) - 0.5, -0.5)
+    ax.set_xlim(0.0, max(2.0, 1.1 * max(ratios, default=0.0)))
+    dress(ax, title, "standard deviation of the draws / linear one [–]", "")
+    figure.legend(loc="outside lower center", frameon=False, fontsize="small")
+    return figure
 
 
 def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
@@ -34,7 +109,7 @@ def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
     -------
     Figure
     """
-    figure = new_figure(8.6, _MARGIN + _ROW * len(rows))
+    figure = new_figure(8.6, 1.5 + 0.28 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)
     at = np.arange(len(rows))
     left.plot(positive(np.array([row.residual for row in rows])), at, "o", color=COLOURS[0], label="fitted")

@@ -9,8 +9,7 @@ from scipy import signal
 
 import sysid
 from sysid.report.report import render
-from sysid.results.noise_table import noise_of_channels
-from sysid.results.summary import noise_source
+from sysid.results.tables import noise_of_channels, noise_source
 
 
 @pytest.fixture(scope="module")
