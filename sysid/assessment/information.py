@@ -44,9 +44,10 @@ def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Arr
         factor = np.concatenate([np.ones(m), phi[i, mode]])
         A[np.ix_(at, at)] += np.outer(factor, factor) * gram[: at.size, : at.size]
     at = np.concatenate([common, index.rigid])
-    for i, gram in enumerate(grams[1] if len(grams) > 1 else ()):
-        mix = force_columns(gamma, index, i)
-        A[np.ix_(at, at)] += mix.T @ gram @ mix
+    for of_force in grams[1:]:
+        for i, gram in enumerate(of_force):
+            mix = force_columns(gamma, index, i)
+            A[np.ix_(at, at)] += mix.T @ gram @ mix
     return A
 
 

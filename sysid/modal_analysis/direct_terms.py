@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
-from sysid.modal_analysis.relocation import Blocks, relocate
+from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
@@ -26,8 +26,6 @@ _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
 _FEW = 0.25  # of the lines
-
-Poles = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +79,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
             if found is None or not found[2].spikes.any():
                 break
             still = still.at(~found[2].spikes)
-            found = _of_accelerations(still, found[:2])
+            found = _of_accelerations(still)
         if every is None or found is None:
             return None
         omega, ratios, rigid = found
@@ -93,23 +91,19 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     )
 
 
-def _of_accelerations(still: Measurement, near: Poles | None = None) -> tuple[Array, Array, _Fit] | None:
-    """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found.
-
-    Those that were found with more lines of the test are near already.
-    """
+def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
+    """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found."""
     records = Records(still)
     if not records.unit and records.driven < still.n_base:
         return None
-    channels = records.principal(12)
-    poles = (near and _relocated(records, *near, [channels] * 2)) or _poles(records, channels)
+    poles = _poles(records)
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 
-def _poles(records: Records, channels: Blocks, steps: int = 4) -> Poles | None:
+def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
     """Poles of the records beside terms without them; none is removed for explaining no more than noise.
 
-    As many steps as in these principal channels are done before in a few of them, which is quicker.
+    They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
     """
     lines = 2 * np.pi * records.freq[records.freq > 0]
     inputs = records.base.shape[0]
@@ -117,15 +111,11 @@ def _poles(records: Records, channels: Blocks, steps: int = 4) -> Poles | None:
     count = min(records.n_sensors + _SPARE, _MOST, room)
     if count < 1:
         return None
-    blocks = [records.principal(4)] * steps + [channels] * steps
-    return _relocated(records, np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS), blocks)
-
-
-def _relocated(records: Records, omega: Array, ratios: Array, blocks: list[Blocks]) -> Poles | None:
-    """Poles that steps from others lead to, each in its principal channels, as far as the lines tell them."""
-    lines, direct = 2 * np.pi * records.freq[records.freq > 0], _without_poles(records.freq)
-    for channels in blocks:
-        omega, ratios = relocate(records, channels, omega, ratios, lambda: None, direct)
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
+    first, every = records.principal(4), records.principal(12)
+    direct = _without_poles(records.freq)
+    for step in range(steps):
+        omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return (omega[kept], ratios[kept]) if np.any(kept) else None
