@@ -86,7 +86,7 @@ def _end(folder: Path, number: int, reduced: bool, rng: np.random.Generator) -> 
         time.sleep(rng.uniform(0.0, max(ended - kept, 0.0)))
     due = run.processor_seconds
     if not run.limit:
-        run.process.send_signal(signal.SIGINT)
+        os.kill(run.process.pid, signal.SIGINT)  # also of one that has ended, which stays to be asked for its seconds
         run.wait_until((run.out / "result.h5").exists)
         due, saved = 0.0, run.processor_seconds - due
     total = run.end()
@@ -162,14 +162,16 @@ def _wrong(run: _Run) -> str:
 
 
 def _times(folder: Path, large: bool) -> tuple[float, float]:
-    """When a run keeps its first fit, and when it ends, s; found once for each test."""
+    """When a run keeps its first fit, and when it has fitted all, s; found once for each test."""
     known = folder / f"times of {large}"
     if not known.exists():
         run = _Run(folder, f"whole {large}", large)
         run.wait_until(lambda: KEPT in run.said)
         kept = time.perf_counter() - run.begun
-        run.end()
+        run.wait_until(lambda: "local phase" in run.said)
         known.write_text(f"{kept} {time.perf_counter() - run.begun}")
+        run.process.kill()
+        run.end()
     kept, ended = map(float, known.read_text().split())
     return kept, ended
 
