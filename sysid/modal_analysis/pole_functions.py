@@ -33,18 +33,18 @@ class PoleFunctions(NamedTuple):
         For the inputs of all runs.
     inputs : (k,)
         Where these stand among all inputs.
-    own : sequence of OfRun
+    by_run : sequence of OfRun
         For the inputs of one run each.
     """
 
     shared: Array
     inputs: NDArray[np.intp]
-    own: Sequence[OfRun] = ()
+    by_run: Sequence[OfRun] = ()
 
     @property
     def per_pole(self) -> int:
         """Inputs of a pole."""
-        return self.inputs.size + sum(one.inputs.size for one in self.own)
+        return self.inputs.size + sum(one.inputs.size for one in self.by_run)
 
     @property
     def size(self) -> int:
@@ -55,7 +55,7 @@ class PoleFunctions(NamedTuple):
     def places(self) -> list[NDArray[np.intp]]:
         """Where the columns of each run, and last the shared ones, stand pole by pole with all inputs in order."""
         starts = np.arange(0, self.size, self.per_pole)[:, None]
-        return [(starts + inputs).ravel() for inputs in (*(one.inputs for one in self.own), self.inputs)]
+        return [(starts + inputs).ravel() for inputs in (*(one.inputs for one in self.by_run), self.inputs)]
 
     def in_order(self, parts: Sequence[Array]) -> Array:
         """Rows that belong to the columns of each run, and last to the shared ones, pole by pole."""
@@ -63,14 +63,14 @@ class PoleFunctions(NamedTuple):
 
     def squares(self) -> Array:
         """Sums of squares of the columns, (columns,)."""
-        return self.in_order([np.sum(part**2, axis=0) for part in (*(one.columns for one in self.own), self.shared)])
+        return self.in_order([np.sum(part**2, axis=0) for part in (*(one.columns for one in self.by_run), self.shared)])
 
     def dense(self) -> Array:
         """All columns written out, (rows, m * inputs)."""
         out = np.zeros((len(self.shared), self.size))
-        *own, shared = self.places
+        *by_run, shared = self.places
         out[:, shared] = self.shared
-        for one, place in zip(self.own, own, strict=True):
+        for one, place in zip(self.by_run, by_run, strict=True):
             out[np.ix_(one.rows, place)] = one.columns
         return out
 
@@ -78,41 +78,41 @@ class PoleFunctions(NamedTuple):
 class Basis(NamedTuple):
     """Orthonormal columns: those of each run (rows, columns), then those of all, (rows, k)."""
 
-    own: Sequence[tuple[NDArray[np.intp], Array]]
+    by_run: Sequence[tuple[NDArray[np.intp], Array]]
     shared: Array
 
     def answers(self, data: Array) -> Array:
         """Products with data (rows, c), (columns, c)."""
-        return np.concatenate([*(Q.T @ data[rows] for rows, Q in self.own), self.shared.T @ data])
+        return np.concatenate([*(Q.T @ data[rows] for rows, Q in self.by_run), self.shared.T @ data])
 
     def times(self, answers: Array) -> Array:
         """Sums of the columns, (rows, c)."""
-        ends = np.cumsum([Q.shape[1] for _, Q in self.own], dtype=int)
-        *own, shared = np.split(answers, ends)
+        ends = np.cumsum([Q.shape[1] for _, Q in self.by_run], dtype=int)
+        *by_run, shared = np.split(answers, ends)
         out = self.shared @ shared
-        for (rows, Q), part in zip(self.own, own, strict=True):
+        for (rows, Q), part in zip(self.by_run, by_run, strict=True):
             out[rows] += Q @ part
         return np.asarray(out)
 
     def of_run(self, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Rows of one run, without columns that are zero there, and the numbers of those kept."""
-        sizes = [Q.shape[1] for _, Q in self.own]
+        sizes = [Q.shape[1] for _, Q in self.by_run]
         first = np.cumsum([0, *sizes])
         kept = np.arange(first[-1], first[-1] + self.shared.shape[1])
-        for at, (own_rows, Q) in zip(first[:-1], self.own, strict=True):
-            if own_rows[0] == rows[0]:
+        for at, (its_rows, Q) in zip(first[:-1], self.by_run, strict=True):
+            if its_rows[0] == rows[0]:
                 return np.hstack([Q, self.shared[rows]]), np.concatenate([at + np.arange(Q.shape[1]), kept])
         return self.shared[rows], kept
 
     def beside(self, functions: PoleFunctions) -> Beside:
         """What the basis leaves of other columns of the same runs."""
         shared = functions.shared - self.times(self.answers(functions.shared))
-        own, mixed = [], []
-        for (rows, Q), (_, _, columns) in zip(self.own, functions.own, strict=True):
+        by_run, mixed = [], []
+        for (rows, Q), (_, _, columns) in zip(self.by_run, functions.by_run, strict=True):
             left = columns - Q @ (Q.T @ columns)
-            own.append((rows, left))
+            by_run.append((rows, left))
             mixed.append(self.shared[rows].T @ left)
-        return Beside(functions, shared, own, mixed)
+        return Beside(functions, shared, by_run, mixed)
 
 
 class Beside(NamedTuple):
@@ -124,7 +124,7 @@ class Beside(NamedTuple):
 
     functions: PoleFunctions
     shared: Array
-    own: Sequence[tuple[NDArray[np.intp], Array]]
+    by_run: Sequence[tuple[NDArray[np.intp], Array]]
     mixed: Sequence[Array]
 
     def gram(self) -> Array:
@@ -136,7 +136,7 @@ class Beside(NamedTuple):
         out = np.zeros((order.size + shared.size,) * 2)
         out[np.ix_(order, order)] = -mixed.T @ mixed
         out[np.ix_(shared, shared)] = self.shared.T @ self.shared
-        for place, (rows, left) in zip(places, self.own, strict=True):
+        for place, (rows, left) in zip(places, self.by_run, strict=True):
             out[np.ix_(place, place)] += left.T @ left
             cross = left.T @ self.shared[rows]
             out[np.ix_(place, shared)] = cross
@@ -145,13 +145,13 @@ class Beside(NamedTuple):
 
     def squares(self) -> Array:
         """Sums of squares of the columns, (columns,)."""
-        own = zip(self.own, self.mixed, strict=True)
-        parts = [np.sum(left**2, axis=0) - np.sum(mixed**2, axis=0) for (_, left), mixed in own]
+        pairs = zip(self.by_run, self.mixed, strict=True)
+        parts = [np.sum(left**2, axis=0) - np.sum(mixed**2, axis=0) for (_, left), mixed in pairs]
         return self.functions.in_order([*parts, np.sum(self.shared**2, axis=0)])
 
     def products(self, of_shared: Array, left: Array) -> Array:
         """Products of all columns with what a fit leaves (rows, c), those of the shared ones given, (columns, c)."""
-        return self.functions.in_order([*(columns.T @ left[rows] for rows, columns in self.own), of_shared])
+        return self.functions.in_order([*(columns.T @ left[rows] for rows, columns in self.by_run), of_shared])
 
 
 def unit_columns(matrix: Array) -> tuple[Array, Array]:
@@ -166,12 +166,12 @@ def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
 
     Columns of ``functions = Q R diag(sizes)`` stand run by run, the shared ones last.
     """
-    own, sizes, triangles, across = [], [], [], []
+    by_run, sizes, triangles, across = [], [], [], []
     shared, size_of_shared = unit_columns(functions.shared)
-    for rows, _, columns in functions.own:
+    for rows, _, columns in functions.by_run:
         columns, size = unit_columns(columns)
         Q, R = np.linalg.qr(columns)
-        own.append((rows, Q))
+        by_run.append((rows, Q))
         triangles.append(R)
         sizes.append(size)
         here, crossing = shared[rows], np.zeros((Q.shape[1], shared.shape[1]))
@@ -186,4 +186,4 @@ def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
     triangle = scipy.linalg.block_diag(*triangles, R)
     if across:
         triangle[:first, first:] = np.concatenate(across)
-    return Basis(own, Q), triangle, np.concatenate([*sizes, size_of_shared])
+    return Basis(by_run, Q), triangle, np.concatenate([*sizes, size_of_shared])

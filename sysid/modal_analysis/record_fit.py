@@ -29,9 +29,7 @@ from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
-_LEAST_SEEN = 1e-10  # of the diagonal of a normal matrix, that is added to what does not show
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
-_SAME_MATRIX = 0.2  # change of modes and levels, relative, within which a normal matrix serves
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
 
@@ -298,9 +296,9 @@ class _Equations:
         self.at: tuple[Parameters, Array] | None = None
         self.normal: Array = np.zeros((0, 0))
 
-    def __call__(self, p: Parameters, levels: Array) -> NormalEquations:
-        """At these parameters and levels; the matrix from a coarser model where there is one."""
-        if self.at is not None and _moved(self.at[0].modes, p.modes) + _largest(levels / self.at[1]) < _SAME_MATRIX:
+    def __call__(self, p: Parameters, levels: Array, near: float = 0.2) -> NormalEquations:
+        """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
+        if self.at is not None and _moved(self.at[0].modes, p.modes) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
@@ -404,7 +402,7 @@ def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArra
     """Function of some of the modes, (m,): the same without all of these together."""
     model, N = fit.model, fit.normal if normal is None else normal
     unit, m, n, index = units_of(N), model.m, model.n, model.index
-    inverse = np.linalg.inv(N * np.outer(unit, unit) + _LEAST_SEEN * np.eye(model.size))
+    inverse = np.linalg.inv(N * np.outer(unit, unit) + 1e-10 * np.eye(model.size))
     shapes = np.arange(index.phi.stop).reshape(n, m)
     # With its shape at zero neither participation, pole nor transient of a mode show.
     others = np.hstack([

@@ -25,8 +25,6 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
-_AT_ONCE = 16  # trial poles
-_APART = 10.0  # half half-power widths between further modes that are tried together
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
@@ -135,8 +133,11 @@ def _outer(rows: Array) -> Array:
     return rows[:, :, None] * rows[:, None]
 
 
-def trials_of(fit: RecordFit) -> Trials:
-    """Trial poles at all frequencies of the lines, in steps of half a half-power width, of three damping ratios."""
+def trials_of(fit: RecordFit, at_once: int = 16) -> Trials:
+    """Trial poles at all frequencies of the lines, in steps of half a half-power width, of three damping ratios.
+
+    So many at once: neighbours have nearly the same lines.
+    """
     ends = 2 * np.pi * fit.test.freq[[0, -1]]
     trials = [np.geomspace(ends[0], ends[1], int(np.log(ends[1] / ends[0]) / ratio) + 2) for ratio in _RATIOS]
     omega, ratios = np.concatenate(trials), np.repeat(_RATIOS, [one.size for one in trials])
@@ -145,7 +146,7 @@ def trials_of(fit: RecordFit) -> Trials:
     out = Trials(omega, ratios, np.zeros((K, c, inputs)), np.zeros((K, c, c)), np.zeros((K, inputs, inputs)))
     strength = np.zeros(K)
     cuts = np.concatenate([[0], np.cumsum([one.size for one in trials])])
-    blocks = [slice(i, min(i + _AT_ONCE, b)) for a, b in pairwise(cuts) for i in range(a, b, _AT_ONCE)]
+    blocks = [slice(i, min(i + at_once, b)) for a, b in pairwise(cuts) for i in range(a, b, at_once)]
     for chunk in model.chunks(fit.parameters):
         _add(out, strength, blocks, chunk, fit.levels)
     used = strength > 0
@@ -185,8 +186,11 @@ def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, lev
         strength[block] += total
 
 
-def peaks_of(fit: RecordFit, least: float) -> list[Peak]:
-    """Modes that the errors of a fit hold, worth more than `least`, far apart, the worthiest first."""
+def peaks_of(fit: RecordFit, least: float, widths: float = 5.0) -> list[Peak]:
+    """Modes that the errors of a fit hold, worth more than `least`, the worthiest first.
+
+    They are so many half-power widths apart.
+    """
     trials = trials_of(fit)
     worth, shapes, loads = trials.likeliest()
     found: list[int] = []
@@ -194,7 +198,7 @@ def peaks_of(fit: RecordFit, least: float) -> list[Peak]:
         if worth[at] <= least:
             break
         apart = np.abs(np.log(trials.omega[at] / trials.omega[found]))
-        if np.all(apart > _APART * np.maximum(trials.ratios[at], trials.ratios[found])):
+        if np.all(apart > 2 * widths * np.maximum(trials.ratios[at], trials.ratios[found])):
             found.append(int(at))
     return [Peak(trials.omega[at], trials.ratios[at], shapes[at], loads[at]) for at in found]
 

@@ -67,14 +67,14 @@ class ResidueFit:
     @property
     def Q(self) -> Array:  # noqa: N802
         """Orthonormal basis (rows, columns) of a test whose runs share all functions."""
-        assert not self.basis.own
+        assert not self.basis.by_run
         return self.basis.shared
 
     def beside(self, functions: PoleFunctions) -> tuple[Beside, Array]:
         """What the fit leaves of other functions, and their products with what is left of the data, (columns, c)."""
         beside = self.basis.beside(functions)
         of_shared = beside.shared.T @ (self.data if self._is_large else self.left)
-        return beside, beside.products(of_shared, self.left) if beside.own else of_shared
+        return beside, beside.products(of_shared, self.left) if beside.by_run else of_shared
 
     @cached_property
     def _difference(self) -> float:
@@ -184,13 +184,13 @@ class Records:
         shared = [self.basis(functions[0], self._shared), *(self.basis(f, self.driven) for f in functions[1:])]
         count, r = len(self.base), self.driven
         inputs = np.concatenate([np.arange(self._shared), count + np.arange(r * (len(functions) - 1))])
-        own = []
+        by_run = []
         for both, at in self._ends:
             lines = both[: both.size // 2]
             columns = functions[0][:, None, self.line[lines]] * self.base[np.ix_(at, lines)]
-            own.append(OfRun(both, at, stacked(columns.reshape(-1, lines.size))))
+            by_run.append(OfRun(both, at, stacked(columns.reshape(-1, lines.size))))
         return PoleFunctions(
-            np.concatenate([part.reshape(rows, m, -1) for part in shared], axis=2).reshape(rows, -1), inputs, own
+            np.concatenate([part.reshape(rows, m, -1) for part in shared], axis=2).reshape(rows, -1), inputs, by_run
         )
 
     @property
