@@ -10,7 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sysid.cli import draws, sweeps, trust
+import numpy as np
+
+from sysid.cli import sweeps, trust
 from sysid.cli.files import alone_in, png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
@@ -20,11 +22,17 @@ from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
 from sysid.jobs.ledger import FILE_NAME as LEDGER
 from sysid.jobs.minima import Minimum, as_good, distinct
+from sysid.jobs.spread import Spread, spreads
 from sysid.jobs.submit import submit
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.tables import counted
 from sysid.structure.thresholds import EXACT
+
+_LARGER = (
+    "draws have the noise under which least squares scatter as Huber's loss does on the records: it is some per cent\n"
+    "larger than theirs, and so are the residuals"
+)
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
@@ -65,7 +73,7 @@ def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argpa
         elif sweep is not None:
             sweeps.report_sweep(folder, result, recipe, sweep, ends, out)
         elif options.draws is not None:
-            draws.report_draws(folder, result, recipe, ends, out)
+            report_draws(folder, result, recipe, ends, out)
         else:
             minima = distinct(result.prepared, ends)
             out.write(f"\n{minima_table(minima, len(ends))}\n\n")
@@ -173,3 +181,49 @@ def _write(
         rows.append((end.index, end.seed, end.success, left, minimum, end.message, *map(repr, end.x.tolist())))
     drawn = png(picture, minima, recipe.title, goal=problem.goal) if minima else None
     write_files(folder, {"starts.csv": table_as_csv(rows), "minima.png": drawn}, out)
+
+
+def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
+    """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
+    from sysid.plot.refinement import draws as picture
+
+    names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
+    each: list[Sequence[object]] = [names]
+    for end in ends:
+        left = repr(end.residual) if end.has_result else ""
+        each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
+    count = sum(end.success for end in ends)
+    files: dict[str, bytes | None] = {"draws.csv": table_as_csv(each), "spreads.csv": None, "draws.png": None}
+    if count < 2:
+        out.write(f"\n{count} of {len(ends)} draws ended in a fit; two are needed for a spread\n\n")
+    else:
+        found = spreads(result, ends)
+        out.write(f"\n{spread_table(found, count, len(ends))}\n\n")
+        if result.problem.loss == "huber":
+            out.write(f"{_LARGER}\n\n")
+        out.answer(spreads=[vars(spread) for spread in found])
+        of_all: list[Sequence[object]] = [("quantity", "value", "linear_std", "draws_std", "inside_share")]
+        of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
+        files["spreads.csv"] = table_as_csv(of_all)
+        if any(np.isfinite(spread.ratio) for spread in found):
+            files["draws.png"] = png(picture, found, count, recipe.title)
+    write_files(folder, files, out)
+
+
+def spread_table(found: Sequence[Spread], count: int, asked: int) -> str:
+    """A line a quantity: value, standard deviations to first order and of the draws, and how often it was within."""
+    width = max(len(spread.name) for spread in found)
+    lines = [f"{'':{width}}  {'value':>10}  {'linear std':>10}  {'draws std':>10}  ratio  within, %"]
+    for spread in found:
+        known = np.isfinite(spread.ratio)
+        beside = f"{spread.ratio:5.2f}  {100 * spread.inside:9.0f}" if known else "    -          -"
+        linear = f"{spread.std:10.3g}" if known else "         -"
+        lines.append(f"{spread.name:{width}}  {spread.value:10.5g}  {linear}  {spread.drawn:10.3g}  {beside}")
+    lines += [
+        f"std: standard deviation, to first order and of {count} draws, whose ratio chance moves by "
+        f"{100 / np.sqrt(2 * count):.0f} %; within: draws",
+        "in the linear interval, which should hold 95 %",
+    ]
+    if count < asked:
+        lines.append(f"{counted(asked - count, 'draw')} without a fit: not counted")
+    return "\n".join(lines)

@@ -116,7 +116,8 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iter
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
-    raw, noise = _recorded(it, test), level.response
+    given, noise = it.records.measurement, level.response
+    raw = given if test is it.measurement and given.is_whole else None  # with transients, where these were taken off
     words, unit = ("transmissibility", "–") if unit_runs else ("spectrum of acceleration", "m/s², scaled as given")
     if unit_runs and not test.translational.all():
         unit = "per unit base motion"
@@ -184,12 +185,6 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
     Errors of different directions may add up whatever their phases: the sum is never too small.
     """
     return np.asarray(LIKELY * np.einsum("cdf,rdf->rcf", std, np.abs(test.base)))
-
-
-def _recorded(it: Identification, test: Measurement) -> Measurement | None:
-    """The records with their transients, where these were taken off."""
-    given = it.records.measurement
-    return given if test is it.measurement and given.is_whole else None
 
 
 def _levels(values: NDArray[Any] | None, channel: int, test: Measurement) -> Array | None:

@@ -258,12 +258,12 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 
 def _residuals(it: Identification, level: NoiseLevel) -> str:
     """Residual of each channel, beside its noise."""
-    test = _as_fitted(it, it.measurement)
+    test = it.fitted.records
     left = [1 - score for score in scores(it.structure, test).relative]
     channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
     if test.force is not None:
         noise = share_of_noise(level.force, test.force)
-        force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
+        force = [*zip(test.base_axes or (), _score(test.predict_force(it.structure), test.force), noise, strict=True)]
         channels += [(f"base force {axis}", 1 - score, residual) for axis, score, residual in force]
     known = any(np.isfinite(noise) for *_, noise in channels)
     rows = [(name, aligned(100 * residual), *[aligned(100 * noise)] * known) for name, residual, noise in channels]
@@ -273,11 +273,6 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
     caption += "to the base; and its noise likewise." if known else "to the base."
     caption += " Outliers that stand alone are left out." * (test is not it.measurement)
     return table(("channel", "left [%]", *[f"noise{level.bound} [%]"] * known), rows, caption)
-
-
-def _as_fitted(it: Identification, test: Measurement) -> Measurement:
-    """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
-    return it.fitted.records if test is it.measurement else test
 
 
 def _noise(it: Identification) -> str:
@@ -344,9 +339,7 @@ def _validation(it: Identification) -> str:
             _responses(it, test, noise_of_test(test, it.structure)),
         ]
     if parts:
-        parts.append(
-            "<h3>The test that was fitted, for comparison</h3>" + _score_table(it, _as_fitted(it, it.measurement))
-        )
+        parts.append("<h3>The test that was fitted, for comparison</h3>" + _score_table(it, it.fitted.records))
     return "\n".join(parts)
 
 
@@ -473,11 +466,6 @@ def _what_ran(it: Identification) -> str:
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")
         + log
     )
-
-
-def _score_of_force(it: Identification, test: Measurement) -> Array:
-    assert test.force is not None
-    return _score(test.predict_force(it.structure), test.force)
 
 
 def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:

@@ -68,7 +68,7 @@ def summary(it: Answer) -> str:
         *_unknowns(it),
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}"
         + f"; {counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
-        *_phases(it),
+        *(in_columns([COLUMNS, *it.phases]) if len(it.phases) > 1 else []),
         *filter(None, [it.history.refinement_in_words]),
         *map(str, (*it.of_kind("strategy"), *it.notes)),
         "rigid-body mass "
@@ -94,12 +94,6 @@ def summary(it: Answer) -> str:
     lines += [_NOT_COMPUTED] if it.hurried else []
     lines.append(f"search: {it.message}")
     return "\n".join(_folded(line) for line in lines)
-
-
-def _phases(it: Answer) -> list[str]:
-    """Table of what each phase left, where there was more than one."""
-    rows = it.phases
-    return in_columns([COLUMNS, *rows]) if len(rows) > 1 else []
 
 
 def _noise(it: Answer) -> list[str]:

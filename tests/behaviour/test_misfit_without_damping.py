@@ -3,10 +3,10 @@
 import casadi as ca
 import numpy as np
 import pytest
-from sysid.report.noise_level import noise_of_test
 
 import sysid
 from sysid.report import opening, report
+from sysid.report.opening import noise_of_test
 from sysid.results.tables import quantities
 
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.cli import draws
 from sysid.cli import main as cli
+from sysid.cli import refine
 from sysid.cli.output import Output
 from sysid.jobs import JobResult
 from sysid.report import report
@@ -148,7 +148,7 @@ def test_draws_without_a_spread_leave_no_picture_of_earlier_ones(floors, capsys,
         (tmp_path / name).write_text("of earlier draws")
     result = sysid.load(floors)
     ends = [JobResult(0, 0, True, "", result.x, 0.02), JobResult(1, 0, False, "lost", result.x[:0], np.nan)]
-    draws.report_draws(tmp_path, result, result.recipe, ends, Output())
+    refine.report_draws(tmp_path, result, result.recipe, ends, Output())
     assert "1 of 2 draws" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["draws.csv"]
 
