@@ -16,7 +16,8 @@ from benchmarks.modal.spread import WORKERS
 from benchmarks.own_process import figures_of
 
 STRUCTURES, SHORT = 60, 6
-PATIENCE, SHORT_PATIENCE = 300.0, 15.0  # s a structure, after which it has no result
+PATIENCE, SHORT_PATIENCE = 120, 15  # s of processor time a structure, after which it has no result
+SLOWER = 10  # by the clock, at most, on a machine with other work
 KNOWN = 0.1  # of the root of two diagonal entries: deviations of M, where it must be determined
 SHARE_KNOWN = 0.75  # of all structures: 45 of 60
 SHARE = 0.97
@@ -53,8 +54,11 @@ def lines(reduced: bool) -> Iterator[Line]:
                f"{slowest[2].get('seconds', np.nan):.1f}")  # fmt: skip
 
 
-def _figures(number: int, patience: float) -> dict:
-    return figures_of("benchmarks.band.one_structure", [str(number)], patience)
+def _figures(number: int, patience: int) -> dict:
+    figures = figures_of("benchmarks.band.one_structure", [str(number), str(patience)], SLOWER * patience)
+    if figures.get("said") == "no output":  # as of a process that its system ended
+        return {"said": f"not done after {patience} s of processor time"}
+    return figures
 
 
 def _poles(what: str, cases: list[Case]) -> Line:

@@ -1,11 +1,13 @@
 """One continuous structure identified from its test, beside the truth and the Cramér-Rao bound.
 
-``python -m benchmarks.band.one_structure NUMBER`` prints the figures as JSON.
+``python -m benchmarks.band.one_structure NUMBER SECONDS`` prints the figures as JSON, unless it takes more of a
+processor's time.
 """
 
 from __future__ import annotations
 
 import json
+import resource
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -131,7 +133,9 @@ def _drive(found: sysid.Structure, truth: Continuous, test: Draw) -> float:
 
 def main() -> None:
     """Run one, and print its figures, those of the bound with them."""
-    truth = structure(int(sys.argv[1]))
+    number, seconds = (int(argument) for argument in sys.argv[1:])
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    truth = structure(number)
     test = draw(truth)
     least = bound(truth, test)
     try:
