@@ -246,7 +246,7 @@ def test_an_interrupt_while_outliers_are_looked_for_keeps_the_modes(storeys, tmp
 def test_a_stopped_fit_of_a_steady_sine_is_refused_too(records):
     simulated, _ = records
     setting, sine = simulated.four_storeys(), 4.3
-    turn = np.exp(2j * np.pi * sine * np.arange(10 * int(setting.sample_rate)) / setting.sample_rate)
+    turn = np.exp(2j * np.pi * sine * np.arange(30 * int(setting.sample_rate)) / setting.sample_rate)
     H, Z = setting.structure.transmissibility([sine])[:, 0], setting.structure.base_force([sine])[0]
     moving = simulated.Records(turn.real[None], (H * turn).real, (Z * turn).real, setting.sample_rate)
     noisy, _ = simulated.with_noise(moving, np.random.default_rng(0), 0.01)
