@@ -125,7 +125,13 @@ def prepare(problem: Prepared, session: Session) -> None:
             problem.modal = fit_tests(problem.stated.tests, monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()
-        problem.prepare(session.preparing)
+        try:
+            problem.prepare(session.preparing)
+        except (Stop, KeyboardInterrupt):  # there are modes, whose outliers were still looked for
+            if not problem.stop_screening():
+                raise
+            session.finish()
+            problem.prepare()
         problem.check()
     except Stop as stop:
         raise SolverError(f"{stop}: nothing is identified") from None

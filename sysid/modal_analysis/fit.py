@@ -60,20 +60,27 @@ def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> Record
         best = monitor.best
         if not isinstance(best, RecordFit):
             raise
+    _refuse_sines(best, test)
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
 
 
-def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
+    """Refuse modes of records of a steady sine where no other line shows them."""
     sentence = steady_sine(test)
+    if sentence is not None and (not fit.settled or at_sines_alone(test, fit.parameters.modes.omega)):
+        raise InputError(sentence)
+
+
+def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     try:
         fit = _white_fit(test, monitor)
     except (InputError, np.linalg.LinAlgError) as error:
+        sentence = steady_sine(test)
         if sentence is None:
             raise
         raise InputError(sentence) from error
-    if sentence is not None and (not fit.settled or at_sines_alone(test, fit.parameters.modes.omega)):
-        raise InputError(sentence)
+    _refuse_sines(fit, test)
     monitor.doing = "levels of noise that vary"
     fit = with_varying_levels(fit, monitor=monitor)
     if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
@@ -234,8 +241,9 @@ def without_transients(fit: RecordFit) -> Measurement:
     )  # fmt: skip
 
 
+@one_thread()
 def estimate(fit: RecordFit) -> ModalEstimate:
-    """Modes in ascending order, with their information."""
+    """Modes in ascending order, with their information: the same bits where a stored fit is read."""
     modes, p, index = fit.parameters.modes, fit.parameters, fit.model.index
     order = np.argsort(modes.omega, kind="stable")
     A, B, gain = fit.information(), scatter(fit), gain_errors_of(fit)

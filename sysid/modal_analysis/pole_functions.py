@@ -14,6 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 
 class OfRun(NamedTuple):
@@ -171,6 +172,10 @@ def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
     for rows, _, columns in functions.by_run:
         columns, size = unit_columns(columns)
         Q, R = np.linalg.qr(columns)
+        lacking = R.shape[1] - len(R)
+        if lacking > 0:  # a short run has fewer rows than columns: those beyond are combinations of the others
+            Q = np.pad(Q, ((0, 0), (0, lacking)))
+            R = np.vstack([R, ROUND_OFF * np.eye(R.shape[1])[-lacking:]])
         by_run.append((rows, Q))
         triangles.append(R)
         sizes.append(size)

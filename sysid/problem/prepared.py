@@ -117,6 +117,19 @@ class Prepared:
         modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
         return Prepared(self.stated, modal, in_squares=True)
 
+    def stop_screening(self) -> bool:
+        """Fit squares of whole records as they stand, as where the fit of their modes was stopped; False without any.
+
+        Their estimates say so from then on, and a stored result too.
+        """
+        if self.in_squares or not any(one.by_modes for one in self.modal):
+            return False
+        self.modal = tuple(
+            one if one.record_fit is None else replace(one, record_fit=replace(one.record_fit, stopped=True))
+            for one in self.modal
+        )
+        return True
+
     @property
     def stopped(self) -> bool:
         """True where the fit of the modes of a test was stopped."""

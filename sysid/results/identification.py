@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import InputError, finite_array, instance, shown, text, whole_number
+from sysid.files.tree import to_bytes
 from sysid.finding import Finding
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
@@ -286,8 +287,7 @@ class Identification(Answer):
         """
         instance("problem", problem, Problem)
         _check_records(self.records, problem)
-        tree = self.prepared.to_tree() if self.part is None else self.part.tree
-        prepared = Prepared.from_tree(problem, tree)
+        prepared = Prepared.from_tree(problem, self._tree_for(problem))
         if self.x is not None:
             _check_unknowns(self, self.x, prepared)
         kept = {
@@ -296,6 +296,16 @@ class Identification(Answer):
             if field.init and field.name not in ("problem", "prepared")
         }
         return type(self)(**kept, problem=problem, prepared=prepared)
+
+    def _tree_for(self, problem: Problem) -> dict[str, Any]:
+        """What was found of the records, for a problem that may state other things of them: fits of its tests alone."""
+        if self.part is None:
+            tree, tests = self.prepared.to_tree(), [test.to_tree() for test in self.problem.tests]
+        else:
+            tree, tests = self.part.tree, [self.part.records.measurement.to_tree()]
+        given = [to_bytes(test.to_tree(), 0) for test in problem.tests]
+        known = dict(zip((to_bytes(test, 0) for test in tests), tree.get("fits") or (), strict=False))
+        return {**tree, "fits": [known.get(test) for test in given]}
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:

@@ -4,6 +4,7 @@ import importlib
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -225,6 +226,47 @@ def test_a_stopped_fit_is_kept_by_hubers_loss_and_by_several_tests(storeys):
     result = sysid.identify(huber, rng=0, callback=stopped_callback(KeyboardInterrupt, "poles by the noise found"))
     assert result.interrupted and result.structure.n == 4
     assert result.of_kind("modes not all tried") and result.of_kind("search")
+
+
+def test_an_interrupt_while_outliers_are_looked_for_keeps_the_modes(storeys, tmp_path):
+    huber = sysid.Problem(storeys(20.0), mass=sysid.FullMass(), loss="huber")
+
+    def callback(progress):
+        if progress.phase == "poles" and not progress.doing:
+            raise KeyboardInterrupt
+
+    result = sysid.identify(huber, rng=0, callback=callback)
+    assert result.structure.n == 4 and result.interrupted and result.success
+    assert result.of_kind("modes not all tried")
+    result.save(tmp_path)
+    again = sysid.load(tmp_path)
+    assert again.summary() == result.summary() and again.residual == result.residual
+
+
+def test_a_stopped_fit_of_a_steady_sine_is_refused_too(records):
+    simulated, _ = records
+    setting, sine = simulated.four_storeys(), 4.3
+    turn = np.exp(2j * np.pi * sine * np.arange(30 * int(setting.sample_rate)) / setting.sample_rate)
+    H, Z = setting.structure.transmissibility([sine])[:, 0], setting.structure.base_force([sine])[0]
+    moving = simulated.Records(turn.real[None], (H * turn).real, (Z * turn).real, setting.sample_rate)
+    noisy, _ = simulated.with_noise(moving, np.random.default_rng(0), 0.01)
+    test = sysid.Measurement.from_time(
+        [(noisy.base, noisy.response, noisy.force)],
+        setting.sample_rate, rigid_body=np.ones((4, 1)), band=setting.lines,
+    )  # fmt: skip
+    with pytest.raises(sysid.InputError, match="steady sine"):
+        whole_fit(test, monitor=Stopped(0))
+
+
+def test_a_stored_fit_stands_for_no_test_of_which_something_else_is_stated(storeys, tmp_path):
+    test = storeys(20.0)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    result.save(tmp_path)
+    noise = result.modal[0].noise
+    stated = type(noise)(*(5 * part for part in (noise.response, noise.base, noise.force)))
+    other = replace(test, whole=replace(test.whole, noise=stated))
+    given = sysid.load(tmp_path, problem=sysid.Problem(other, mass=sysid.FullMass()))
+    np.testing.assert_allclose(given.modal[0].noise.response, stated.response, rtol=1e-12)
 
 
 def test_the_time_limit_ends_a_fit_that_has_something_to_keep(storeys, monkeypatch):

@@ -101,3 +101,19 @@ def test_other_columns_are_projected(test):
     np.testing.assert_allclose(beside.gram(), left.T @ left, atol=1e-10 * np.abs(left.T @ left).max())
     np.testing.assert_allclose(beside.squares(), np.sum(left**2, axis=0), rtol=1e-9)
     np.testing.assert_allclose(products, left.T @ records.data, atol=1e-10 * np.abs(products).max())
+
+
+def test_a_short_run_of_fewer_rows_than_columns_is_fitted_wholly():
+    """Against least squares on all columns written out, which takes those beyond as combinations of the others."""
+    rng = np.random.default_rng(0)
+    runs = [(rng.standard_normal((2, samples)), rng.standard_normal((3, samples)), None) for samples in (800, 40)]
+    short = sysid.Measurement.from_time(
+        runs, RATE, rigid_body=rng.uniform(-0.7, 0.7, (3, 2)), band=(0.5, 7.0), estimator="records"
+    )
+    omega, ratios = 2 * np.pi * np.linspace(1.0, 6.0, 15), np.full(15, 0.02)
+    X, data = design(short, omega, ratios, False)
+    flat = X.reshape(len(X), -1)
+    left = data - flat @ np.linalg.lstsq(flat, data, rcond=None)[0]
+    fit = Records(short).fit(omega, ratios)
+    assert fit.squared_error == pytest.approx(np.sum(left**2), rel=1e-8)
+    assert np.all(np.isfinite(fit.residues)) and np.all(fit.gain >= 0)
