@@ -30,7 +30,7 @@ from sysid.modal_analysis.fit_monitor import FitMonitor, Fitted
 
 STOPS, LATE = 20, 2.0  # s, by which a run ends after the signal or the time limit
 DRIFT, PATIENCE = 0.03, 20.0  # of the first frequency over a record; s until there is an answer
-KEPT = "a fit is kept"
+BEGINS, KEPT = "the command begins", "a fit is kept"
 FILES = {"result.h5", "summary.json", "report.html"}
 MODULE = """
 import sysid
@@ -80,6 +80,8 @@ def _end(folder: Path, number: int, reduced: bool, rng: np.random.Generator) -> 
     kept, ended = _times(folder, large)
     run = _Run(folder, str(number), large, 0.0 if number % 2 == 0 else float(_limit(rng, kept, ended)))
     if run.limit:
+        run.wait_until(lambda: BEGINS in run.said)  # all is imported, and the clock of the limit begins
+        run.begun = time.perf_counter()
         run.wait_until(lambda: time.perf_counter() > run.begun + run.limit)
     else:
         run.wait_until(lambda: KEPT in run.said)
@@ -199,6 +201,8 @@ def main() -> None:
 
     FitMonitor.keep = told  # type: ignore[method-assign]
     sys.path.insert(0, str(Path.cwd()))
+    sys.stderr.write(f"{BEGINS}\n")
+    sys.stderr.flush()
     cli.command()
 
 
