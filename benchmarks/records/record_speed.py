@@ -82,7 +82,7 @@ def dummy() -> Setting:
 
 CASES = {
     "four_storeys": Case(four_storeys, one_run, 2.0),
-    "five_short_runs": Case(lambda: of_sensors(4, 40.0, 100.0, 12.0), five_times, 2.0),
+    "five_short_runs": Case(lambda: of_sensors(4, 40.0, 100.0, 12.0), five_times, 4.0),
     "ten_minutes": Case(ten_minutes, one_run, 8.0),
     "five_runs": Case(lambda: of_sensors(6, 120.0, 200.0, 30.0), five_times, 10.0),
     "softening": Case(frame, softening, 20.0, force=False),
