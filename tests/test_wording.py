@@ -30,7 +30,7 @@ from sysid import (
     catalogue,
     errors,
 )
-from sysid.cli import doctor, draws, sweeps, trust, unfinished
+from sysid.cli import doctor, refine, sweeps, trust, unfinished
 from sysid.cli import main as cli
 from sysid.cli.files import alone_in, results_folder
 from sysid.cli.output import Output
@@ -517,7 +517,7 @@ def test_doctor_says_what_is_wrong(capsys, monkeypatch):
 def test_draws_say_why_there_is_no_spread(here, capsys):
     it = answer("force")
     ends = [JobResult(0, 0, True, "", it.x, 0.02), JobResult(1, 0, False, "lost", it.x[:0], np.nan)]
-    draws.report_draws(Path("out"), it, Recipe("pair.py"), ends, Output())
+    refine.report_draws(Path("out"), it, Recipe("pair.py"), ends, Output())
     assert capsys.readouterr().out.splitlines()[1] == "1 of 2 draws ended in a fit; two are needed for a spread"
 
 
