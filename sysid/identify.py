@@ -119,19 +119,14 @@ def identify(
 
 def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
-    monitor = session.fit_monitor()
     try:
-        with regularly(monitor.check):
+        with regularly((monitor := session.fit_monitor()).check):
             problem.modal = fit_tests(problem.stated.tests, monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()
-        try:
-            problem.prepare(session.preparing)
-        except (Stop, KeyboardInterrupt):  # there are modes, whose outliers were still looked for
-            if not problem.stop_screening():
-                raise
+        problem.prepare(session.preparing)
+        if problem.stopped:  # perhaps while outliers were looked for
             session.finish()
-            problem.prepare()
         problem.check()
     except Stop as stop:
         raise SolverError(f"{stop}: nothing is identified") from None

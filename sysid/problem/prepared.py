@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import estimate, fit_modes
@@ -63,7 +63,12 @@ class Prepared:
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
-        self.screened = self._screened(monitor)
+        try:
+            self.screened = self._screened(monitor)
+        except (Stop, KeyboardInterrupt):
+            if not self._stop_screening():
+                raise
+            self.screened, monitor = self._screened(None), None
         geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
         try:
@@ -117,7 +122,7 @@ class Prepared:
         modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
         return Prepared(self.stated, modal, in_squares=True)
 
-    def stop_screening(self) -> bool:
+    def _stop_screening(self) -> bool:
         """Fit squares of whole records as they stand, as where the fit of their modes was stopped; False without any.
 
         Their estimates say so from then on, and a stored result too.
