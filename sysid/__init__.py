@@ -10,11 +10,11 @@ from sysid.errors import InputError, SolverError, SysidError
 from sysid.export.export import export
 from sysid.files.reading import read
 from sysid.identify import identify
+from sysid.measurement.in_time import TimeScores, time_scores
 from sysid.measurement.measurement import Measurement, Sensor
 from sysid.measurement.rigid_body import rigid_body
 from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
-from sysid.measurement.time_scores import TimeScores, time_scores
 from sysid.measurement.whole import NoiseLevels
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass

@@ -12,7 +12,7 @@ import scipy.linalg
 
 import sysid
 from sysid.frame import Beam, Frame, PointMass, Section
-from sysid.structure.axes import BASE_AXES, rigid_motion
+from sysid.structure.sensor import BASE_AXES, rigid_motion
 
 MODES = 20
 BAND = (8.0, 200.0)  # Hz

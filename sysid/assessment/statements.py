@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.assessment.information import Index
-from sysid.assessment.parametrisation import gauge_of, slope_of_drawn_mass
+from sysid.assessment.sensitivity import gauge_of, slope_of_drawn_mass
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.prepared import Prepared

@@ -15,22 +15,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.checks.gains import GainErrors, gain_errors
-from sysid.assessment.information import gain_gradients, information, spectra_of, spread
-from sysid.assessment.modal_mass_cone import open_modes
-from sysid.assessment.parametrisation import parametrisation
-from sysid.assessment.perturbations import (
+from sysid.assessment.information import (
     DirectSpectra,
     ModalSpectra,
     Perturbations,
     changes_of_matrices,
+    gain_gradients,
+    information,
+    spectra_of,
+    spread,
     std_of,
 )
+from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,
     meaningful,
     of_outside,
     outside_variables,
+    parametrisation,
     sensitivity,
     with_totals,
 )  # fmt: skip

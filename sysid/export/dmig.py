@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sysid.export.content import one_line_each, statements
-from sysid.export.superelement import superelement_of
+from sysid.export.content import one_line_each, statements, superelement_of
 from sysid.results.identification import Identification
-from sysid.structure.axes import BASE_AXES
+from sysid.structure.sensor import BASE_AXES
 from sysid.structure.structure import Array
 
 PRECISION = "10 significant digits: what 16 characters, the widest field of bulk data, hold beside sign and exponent"

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import matrices_of, one_line_each, statements
-from sysid.export.superelement import superelement_of
+from sysid.export.content import matrices_of, one_line_each, statements, superelement_of
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 

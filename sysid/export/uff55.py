@@ -9,8 +9,7 @@ import numpy as np
 
 from sysid.export.content import one_line_each, reliability, statements
 from sysid.results.identification import Identification
-from sysid.structure.axes import sensor_row
-from sysid.structure.sensor import Sensor
+from sysid.structure.sensor import Sensor, sensor_row
 from sysid.structure.structure import Array
 
 PRECISION = "6 significant digits: dataset 55 prescribes the number format E13.5"

@@ -11,10 +11,10 @@ from zipfile import ZipFile, is_zipfile
 import numpy as np
 
 from sysid.errors import InputError, shown
-from sysid.files import hdf5, matlab
-from sysid.files.allowance import Allowance
+from sysid.files import untrusted
 from sysid.files.recording import Column, Recording
 from sysid.files.spectral import is_abscissa
+from sysid.files.untrusted import Allowance
 
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "srate")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -57,7 +57,7 @@ def read_mat(path: Path) -> Recording:
     if _is_hdf5(path):
         return read_hdf5(path)
     try:
-        matlab.check(path)
+        untrusted.check_matlab(path)
         found = loadmat(path, simplify_cells=True)
     except Exception as error:  # scipy raises many
         words = str(error) or type(error).__name__
@@ -76,13 +76,13 @@ def read_hdf5(path: Path) -> Recording:
         # MATLAB keeps the sizes of empty arrays, and texts as numbers.
         text = _word(item, "MATLAB_class") in ("char", "cell") or "MATLAB_empty" in item.attrs
         if isinstance(item, h5py.Dataset) and not (name.startswith("#") or text) and _is_numeric(item.dtype):
-            hdf5.check_data(item, allowance)
+            untrusted.check_data(item, allowance)
             unit = _word(item, "unit") or _word(item, "units")
             named[name.replace("/", ".")] = (_values(item[()]), unit)
 
     try:
         with h5py.File(path, "r") as file:
-            hdf5.check_all_links(file)
+            untrusted.check_all_links(file)
             file.visititems(visit)
             matlab = any("MATLAB_class" in item.attrs for item in file.values())
     except Exception as error:  # h5py raises many

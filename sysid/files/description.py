@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, as_float, choice, flag, path_of, printable, refuse, sequence, shown, text
-from sysid.structure.axes import base_columns, sensor_row, vector3
+from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
 _FIELDS = ("column", "name", "role", "position", "axis", "unit", "reference")

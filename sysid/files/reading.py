@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, path_of, refuse
-from sysid.files import arrays, assembly, delimited, joined, responses, spectral, universal, xsens_dot
+from sysid.files import arrays, assembly, delimited, responses, spectral, universal, xsens_dot
 from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
 from sysid.files.recording import Recording
@@ -74,7 +74,7 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         return assembly.assembled_in_time([xsens_dot.together(files)], said)  # a unit is a file
     recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
-        recordings = joined.by_folder(recordings, said)
+        recordings = assembly.by_folder(recordings, said)
     else:
         _check_one_each(recordings, said)
     recordings = [spectral.recognised(recording, said) for recording in recordings]

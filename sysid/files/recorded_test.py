@@ -15,8 +15,7 @@ from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.rigid_body import rigid_body
-from sysid.structure.axes import BASE_AXES, base_columns
-from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
+from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
 
 _FORMAT = 1

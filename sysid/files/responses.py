@@ -27,7 +27,7 @@ from sysid.files.assembly import (
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column
-from sysid.structure.axes import BASE_AXES, base_columns
+from sysid.structure.sensor import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray
 
 # Quantity of the numerator and of the denominator; that of a transmissibility is one and the same.

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import InputError, shown
-from sysid.files import hdf5
-from sysid.files.allowance import Allowance
+from sysid.files import untrusted
+from sysid.files.untrusted import Allowance
 
 Tree = dict[str, Any]
 
@@ -120,10 +120,10 @@ def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
     """
     import h5py
 
-    hdf5.check_links(group)
+    untrusted.check_links(group)
     tree = {}
     for name in group.attrs:
-        tree[name] = _value(hdf5.attribute(group, name, allowance))
+        tree[name] = _value(untrusted.attribute(group, name, allowance))
     for name in group:
         item = group[name]
         address = h5py.h5o.get_info(item.id).addr
@@ -131,7 +131,7 @@ def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
             raise InputError(f"{shown(item.name)} stands in two places")
         before.add(address)
         if isinstance(item, h5py.Dataset):
-            hdf5.check_data(item, allowance)
+            untrusted.check_data(item, allowance)
             tree[name] = _value(_numbers(item), array=True)
         else:
             tree[name] = read_group(item, allowance, before)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, sequence
-from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
-from sysid.structure.sensor import Sensor, checked_sensors
+from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, checked_sensors, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
 _ASKEW = 0.02  # by which a sensor's axis, a unit vector, may differ from its row: about one degree

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.pole_functions import unit_columns
-from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray

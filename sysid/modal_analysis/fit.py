@@ -14,6 +14,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.model_order import least_worth, no_modes, with_further_modes, without_spurious_modes
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     WHOLE,
@@ -27,14 +28,12 @@ from sysid.modal_analysis.record_fit import (
     without,
 )
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
-from sysid.modal_analysis.record_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
-from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
-from sysid.modal_analysis.record_spurious import without_spurious_modes
-from sysid.modal_analysis.record_varying import unidentifiable_levels, varying_levels, with_varying_levels
-from sysid.modal_analysis.record_whiteness import excess_of
+from sysid.modal_analysis.rest_test import runs_in_motion
+from sysid.modal_analysis.rough_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
+from sysid.modal_analysis.varying_levels import unidentifiable_levels, varying_levels, with_varying_levels
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.modal_analysis.whiteness_test import excess_of
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 

@@ -22,9 +22,9 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
-from sysid.modal_analysis.record_colour import extra_numbers
+from sysid.modal_analysis.noise_levels import floors, likeliest_levels
+from sysid.modal_analysis.noise_spectrum import extra_numbers
 from sysid.modal_analysis.record_model import TRACES, HeldShapes, NormalEquations, Parameters, RecordModel
-from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Lines, NormalEquations, Parameters, Run, SpectralModel, dots
-from sysid.modal_analysis.record_colour import segments
+from sysid.modal_analysis.noise_spectrum import segments
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
 from sysid.models.expressions import at_point, check_base_last
-from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
-from sysid.models.model import FactoredMass, MassBlocks, Stated, Totals, Written, constant
+from sysid.models.model import FactoredMass, FieldTree, MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, lowest_eigenvalue
 from sysid.structure.thresholds import ROUND_OFF

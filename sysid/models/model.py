@@ -1,4 +1,4 @@
-"""The one contract of a matrix model, and what a model states of its matrix.
+"""The one contract of a matrix model, what a model states of its matrix, and trees of models that are their fields.
 
 A matrix model makes one matrix of unknowns. Those of this package stand beside this file; any other class with the
 methods of `MatrixModel` can be given to a `Problem` as well.
@@ -7,8 +7,8 @@ methods of `MatrixModel` can be given to a `Problem` as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,33 @@ from sysid.models.expressions import as_matrix, check_size, cholesky, square
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown, variable_of
 from sysid.structure.structure import Array, Structure
+
+
+class FieldTree:
+    """`to_tree` and `from_tree` of a dataclass whose fields are numbers, arrays of them, texts or None."""
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the fields as numbers, arrays and texts; `from_tree` takes them back."""
+        return {field.name: plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Self:
+        """Give the model of a tree that `to_tree` made."""
+        return cls(**tree)
+
+
+def plain(value: Any) -> Any:
+    """A number, an array of numbers, a text or None as a tree holds it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Where it is none of these.
+    """
+    if value is None or isinstance(value, str):
+        return value
+    numbers = np.asarray(value, dtype=float)
+    return numbers if numbers.ndim else float(numbers)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from typing import Any
 
 from sysid.errors import InputError, refuse, shown
 from sysid.models.damping import ModalDamping, ProportionalDamping
-from sysid.models.field_tree import plain
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.model import plain
 from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 
 # A problem module that is a file has a name of its own in Python: this, eight digits, and the name of the file.

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.models.expressions import at_point, written_in
-from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
-from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
+from sysid.models.model import FieldTree, MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.spectrum import by_ipopt, nearest_factors
 from sysid.models.unknowns import Unknown, log_sampling, user_site
 from sysid.structure.structure import Array, Structure

@@ -1,14 +1,26 @@
-"""CasADi functions of one candidate over many candidates at once, on CasADi's own virtual machine."""
+"""Functions, modes and responses of many candidates at once, on CasADi's virtual machine and batched LAPACK.
+
+All take matrices of ``count`` candidates: mass M and stiffness K (count, n, n), load vectors B (count, n, d), lines in
+Hz and a shift of the complex frequencies ``s = shift + i w``, 1/s; all return relative accelerations for unit base
+motion, (count, n, d, n_freq). What one candidate gives does not depend on the others, to the last bit.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from itertools import chain
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from sysid.structure.structure import Array
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.response import columns, residual, weights_of_test
+from sysid.models.spectrum import replace_spectrum
+from sysid.problem.matrices import Matrices
+from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import EPSILON, ROUND_OFF
 
 CHUNK = 64  # candidates a call by lines: fixed, so that the bits do not depend on the swarm's size
 _IN_STEP = 128  # candidates that go in step: with more, the virtual machine's memory leaves a processor's cache
@@ -146,3 +158,220 @@ def expanded(function: ca.Function) -> ca.Function:
         return function.expand()
     except RuntimeError:  # a linear solver or an interpolant inside has no scalar form
         return function
+
+
+class BatchModes(NamedTuple):
+    """Mass-normalised modes of many candidates, those of a candidate in ascending order of frequency.
+
+    Attributes
+    ----------
+    shapes : (count, n, n)
+        One mode a row.
+    loads : (count, n, d)
+        Participations.
+    rigid_body_mass : (count, d, d)
+        ``[G; I]' M [G; I]``.
+    """
+
+    shapes: Array
+    loads: Array
+    rigid_body_mass: Array
+
+
+def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Array, BatchModes]:
+    """Squared circular frequencies (count, n), ascending, and modes; a candidate that is no structure has NaN.
+
+    With ``H = Psi Lambda Psi'`` and L the Cholesky factor of M_SS, the modes are ``Phi = L^-T Psi`` and their
+    participations ``Phi' B = Psi' L^-1 B``, ``B = M_SS G + M_S0``.
+
+    Parameters
+    ----------
+    H : (count, n, n)
+        ``L^-1 K_SS L^-T``, the lower triangle at least; overwritten where it is not finite.
+    right : (count, n, n + d)
+        ``[L^-1, L^-1 B]``.
+    rigid : (count, d, d)
+        Rigid-body mass.
+    *base : (count, n, d), (count, d, d)
+        ``L^-1 M_S0`` and M_00, where the whole mass may be indefinite.
+    """
+    n = H.shape[1]
+    broken = ~np.isfinite(np.einsum("pij->p", H))
+    H[broken] = np.eye(n)  # must not stop the eigensolver for the others
+    lam, psi = np.linalg.eigh(H)
+    if base:
+        broken |= base_is_light(*base)
+    lam[broken], psi[broken] = np.nan, np.nan
+    projected = psi.swapaxes(1, 2) @ right
+    return lam, BatchModes(projected[..., :n], projected[..., n:], rigid)
+
+
+def base_is_light(low: Array, base: Array) -> Array:
+    """True where M_00 is less than ``M_S0' M_SS^-1 M_S0``, ``low = L^-1 M_S0``, which no structure's is, (count,)."""
+    size = np.abs(base).max(axis=(1, 2)) + np.abs(low).max(axis=(1, 2)) ** 2
+    return least(base - low.swapaxes(1, 2) @ low) < -ROUND_OFF * size
+
+
+def least(stack: Array) -> Array:
+    """Least eigenvalue of each symmetric matrix; minus infinity where it is no number."""
+    bad = ~np.all(np.isfinite(stack), axis=(1, 2))
+    clean = np.where(bad[:, None, None], 0.0, (stack + stack.swapaxes(1, 2)) / 2)
+    return np.where(bad, -np.inf, np.linalg.eigvalsh(clean)[:, 0])
+
+
+def by_states(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
+    """Response from the eigenvalues of the state space, ``a = s² v``, the damping a matrix (count, n, n).
+
+    Candidates whose eigenvectors (nearly) fall together are solved `by_lines`.
+    """
+    count, n, d = B.shape
+    rates = -np.linalg.solve(M, np.concatenate([K, C, B], axis=2))
+    A = np.zeros((count, 2 * n, 2 * n))
+    A[:, :n, n:] = np.eye(n)
+    A[:, n:] = rates[..., : 2 * n]
+    s = shift + 2j * np.pi * freq
+    lam, vectors = np.linalg.eig(A)
+    right = np.zeros((count, 2 * n, d + 2 * n), dtype=complex)
+    right[:, n:, :d] = rates[..., 2 * n :]
+    right[..., d:] = np.eye(2 * n)
+    solved = _solved(vectors, right)  # of the load vectors, and the inverse
+    strength, inverse = solved[..., :d], solved[..., d:]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        poles = s**2 / (s - lam[:, :, None])
+        response = np.einsum("pik,pkd,pkf->pidf", vectors[:, :n], strength, poles, optimize=True)
+        # Structures have some hundreds; the condition of the eigenvectors of a state matrix, its rows scaled, rises
+        # without bound where they fall together, as at critical damping.
+        ill = ~(_squared_condition(vectors, inverse) < (ROUND_OFF / EPSILON) ** 2)
+    if np.any(ill):
+        response[ill] = by_lines(M[ill], K[ill], C[ill], B[ill], freq, shift)
+    return response
+
+
+def by_lines(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
+    """Response by one linear system a line, the damping a matrix: slower, and exact for every damping.
+
+    NaN where a candidate without damping has a natural frequency on a line.
+    """
+    s = (shift + 2j * np.pi * freq)[:, None, None]
+    response = np.full((*B.shape, freq.size), np.nan, dtype=complex)
+    for p in range(len(M)):  # one candidate at a time: the systems of all lines of all would fill the memory
+        with contextlib.suppress(np.linalg.LinAlgError):
+            v = np.linalg.solve(s**2 * M[p] + s * C[p] + K[p], -B[p, None].astype(complex))
+            response[p] = np.moveaxis(s**2 * v, 0, -1)
+    return response
+
+
+def _solved(matrices: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Solutions of each system; NaN where a matrix is singular."""
+    try:
+        return np.linalg.solve(matrices, right)
+    except np.linalg.LinAlgError:  # one among them, which must not stop the others
+        out = np.full_like(right, np.nan)
+        for p in range(len(matrices)):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                out[p] = np.linalg.solve(matrices[p], right[p])
+        return out
+
+
+def _squared_condition(vectors: ComplexArray, inverse: ComplexArray) -> Array:
+    """Square of the condition number in the Frobenius norm, each row of the vectors scaled to a largest entry of one.
+
+    So that it depends on no unit: displacements stand above velocities.
+    """
+    squares = vectors.real**2 + vectors.imag**2
+    size = squares.max(axis=2, keepdims=True)
+    of_inverse = (inverse.real**2 + inverse.imag**2).sum(axis=1)
+    return (squares / size).sum(axis=(1, 2)) * (of_inverse * size[..., 0]).sum(axis=1)
+
+
+_THREADS = 2  # of CasADi's own; the bits do not depend on it
+
+
+class TestObjective:
+    """Squared relative residual of one test: (count, size) to (count,), as `TestTerm.rows` has it.
+
+    Responses follow from LAPACK's batched eigensolvers: of the undamped structure where damping is by ratios, else of
+    the state space.
+
+    Parameters
+    ----------
+    test : Measurement
+    matrices : Matrices
+    shift : float, 1/s
+        Of the complex frequencies from the imaginary axis.
+    """
+
+    __test__ = False  # pytest takes names in Test for its own
+
+    def __init__(self, test: Measurement, matrices: Matrices, shift: float) -> None:
+        self.test, self.matrices, self.shift = test, matrices, shift
+        x = ca.MX.sym("x", matrices.function.numel_in(0))
+        if matrices.by_ratios:
+            parts = matrices.of_modes(x)
+            self._evaluate = Batch(self._error_of_modes(), _THREADS)
+        else:
+            M, M_S0, M_00, K, C = matrices.function(x)[:5]
+            G = ca.DM(matrices.rigid_body)
+            push = M @ G + M_S0
+            parts = [M, K, C, push, G.T @ push + M_S0.T @ G + M_00, M_S0, M_00]
+        self._expand = Batch(expanded(ca.Function("expand", [x], [ca.densify(part) for part in parts])))
+
+    def squared(self, particles: Array, spectrum: Array | None = None) -> Array:
+        """Of each candidate, (count,); NaN where it is no structure.
+
+        Where damping is by ratios, a `spectrum`, rad/s, takes the place of each candidate's own lowest frequencies.
+        """
+        if self.matrices.by_ratios:
+            return in_chunks(lambda chunk: self._modal(chunk, spectrum), particles)
+        return in_chunks(lambda chunk: self._direct(len(chunk), self._expand(chunk)), particles)
+
+    # -- damping by ratios: modes ------------------------------------------------------------------
+
+    def _error_of_modes(self) -> ca.Function:
+        """Squared residual of modes, rigid-body mass, and x for the ratios."""
+        n, d = self.matrices.rigid_body.shape
+        shapes = {"phi": (n, n), "gamma": (n, d), "omega": (n, 1), "rigid": (d, d)}
+        phi, gamma, omega, rigid = (ca.MX.sym(name, *shape) for name, shape in shapes.items())
+        x = ca.MX.sym("x", self.matrices.function.numel_in(0))
+        ratios = self.matrices.ratio_function(x, omega)
+        at_sensors = phi if self.matrices.at_sensors else ca.DM(self.matrices.recovery) @ phi
+        miss = residual(self.test, at_sensors, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
+        # Negative ratios are no structure's.
+        squared = ca.if_else(ca.mmin(ratios) < 0, np.nan, ca.sumsqr(miss))
+        return ca.Function("squared", [phi, gamma, omega, rigid, x], [squared])
+
+    def _modal(self, particles: Array, spectrum: Array | None) -> Array:
+        lam, modes = batch_modes(*self._expand(particles))
+        if spectrum is not None:
+            lam = replace_spectrum(lam, spectrum)
+        with np.errstate(invalid="ignore"):
+            omega = np.sqrt(lam)
+        phi = modes.shapes.swapaxes(1, 2)
+        return self._evaluate(phi, modes.loads, omega, modes.rigid_body_mass, particles)[0].ravel()
+
+    # -- a damping matrix: state space -------------------------------------------------------------
+
+    def _direct(self, count: int, parts: list[Array]) -> Array:
+        M, K, C, B, rigid, M_S0, M_00 = parts
+        freq, n = self.test.freq, M.shape[1]
+        broken = ~np.all([np.all(np.isfinite(part), axis=(1, 2)) for part in (M, K, C, B)], axis=0)
+        M[broken], K[broken], C[broken], B[broken] = np.eye(n), np.eye(n), 0.0, 0.0
+        light = least(M) <= 0
+        M[light] = np.eye(n)
+        light |= least(K) <= 0
+        remainder = M_00 - M_S0.swapaxes(1, 2) @ np.linalg.solve(M, M_S0)
+        light |= least(remainder) < -ROUND_OFF * np.abs(M).max(axis=(1, 2))
+        # A damping that feeds energy in is no structure's either.
+        light |= least(C) < -ROUND_OFF * np.abs(C).max(axis=(1, 2))
+        K[light] = np.eye(n)
+        base, test = columns(self.test.base), self.test
+        a = by_states(M, K, C, B, freq, self.shift)  # (count, n, d, n_freq)
+        a = np.einsum("pndf,drf->pnrf", a, base.reshape(-1, test.n_runs, freq.size)).reshape(count, n, -1)
+        records = [(test.relative, self.matrices.recovery @ a)]
+        if test.force is not None:
+            records.append((test.force, B.swapaxes(1, 2) @ a + rigid @ base))
+        squared = np.zeros(count)
+        for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=True), strict=True):
+            squared += np.sum(np.abs(weight * (predicted - columns(record))) ** 2, axis=(1, 2)) / scale**2
+        squared[broken | light] = np.nan
+        return squared

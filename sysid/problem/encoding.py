@@ -25,7 +25,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.problem import operations
 from sysid.problem.decoding import Tree, decode
-from sysid.problem.serialised import interpolant_data, interpolant_options, is_compiled, same_text
+from sysid.problem.operations import interpolant_data, interpolant_options, is_compiled, same_text
 from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}

@@ -11,7 +11,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.nlp import quiet_options
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array
-from sysid.swarm import sampling
+from sysid.swarm import box
 
 HELD = 1e-6  # of a constraint's scale: what counts as satisfied
 LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
@@ -24,7 +24,7 @@ def points_of(formulation: Formulation, count: int = 128) -> Array:
 
 def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
-    unit = sampling.latin_hypercube(count, formulation.size, rng)
+    unit = box.latin_hypercube(count, formulation.size, rng)
     low, high = formulation.box
     rows = low + unit * (high - low)
     s = ca.MX.sym("s", formulation.size)

@@ -22,7 +22,7 @@ from sysid.modal_analysis.response import residual, weights_of_test
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Expression, user_site, variable_of
-from sysid.problem.batch_objective import TestObjective
+from sysid.problem.batch import TestObjective
 from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
 from sysid.problem.given import MATRICES, as_models, geometry_of
 from sysid.problem.matrices import Blocks, Matrices, blocks_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.assessment.determination import Intervals
-from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations
+from sysid.assessment.information import DirectSpectra, ModalSpectra, Perturbations
 from sysid.assessment.uncertainty import Uncertainty
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes

@@ -1,18 +1,179 @@
-"""The objective of a whole swarm at once, on compiled CasADi functions."""
+"""The objective of a whole swarm at once, on compiled CasADi functions; by modes alone where the spectrum is held.
+
+There the frequencies are the same for all candidates, so that all sums over lines are made once, before the search
+(`sysid.modal_analysis.gain_series`), and matrices and modes of a candidate are a few products of small arrays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from functools import partial
+from queue import SimpleQueue
 
 import casadi as ca
 import numpy as np
 
-from sysid.problem.batch import Batch, expanded
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
+from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
+from sysid.problem.batch import CHUNK, Batch, BatchModes, batch_modes, expanded
 from sysid.problem.prepared import Prepared
-from sysid.problem.terms import TestTerm
-from sysid.search.held_spectrum_objective import held_spectrum_objective
+from sysid.problem.terms import Term, TestTerm
 from sysid.search.matrix_coordinates import terms_with
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import NEGLIGIBLE
+
+_MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
+_STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
+_NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
+
+
+def held_spectrum_objective(
+    problem: Prepared, term: Term, spectrum: Array | None, unknowns: ca.Function
+) -> HeldSpectrumObjective | None:
+    """The fast objective of the problem's own test; None where it does not apply.
+
+    It does where all natural frequencies are held.
+
+    Parameters
+    ----------
+    problem, term, spectrum
+        As in `HeldSpectrumObjective`; no spectrum where none is held.
+    unknowns : casadi.Function
+        The swarm's coordinates to the unknowns x.
+    """
+    if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
+        return None
+    s, matrices = ca.MX.sym("s", problem.n_variables), term.matrices
+    x = unknowns(s)
+    parts = [matrices.ratio_function(x, ca.DM(np.sort(spectrum))), *matrices.of_modes(x)]
+    expansion = expanded(ca.Function("expansion", [s], [ca.densify(part) for part in parts]))
+    return HeldSpectrumObjective(problem, term, spectrum, expansion)
+
+
+class HeldSpectrumObjective:
+    """Squared relative residual of the records, (count, n_variables) swarm coordinates to (count,).
+
+    Parameters
+    ----------
+    problem : Prepared
+    term : TestTerm
+        The problem's own test, or one in its place.
+    spectrum : (n,), rad/s
+        All natural frequencies, which take the place of each candidate's own.
+    expansion : casadi.Function
+        The swarm's coordinates to damping ratios, and what `sysid.problem.batch.batch_modes` takes.
+    threads : int, optional
+        The result does not depend on it, to the last bit; the machine's processors, at most eight, by default.
+    """
+
+    def __init__(
+        self,
+        problem: Prepared,
+        term: TestTerm,
+        spectrum: Array,
+        expansion: ca.Function,
+        threads: int | None = None,
+    ) -> None:
+        test = term.test
+        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
+        self.expansion, self._share = expansion, term.weight**2
+        self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
+        recovery = term.matrices.recovery, np.eye(problem.geometry.d)
+        self._records: list[tuple[SummedRecord, float]] = []
+        sizes: list[tuple[float, float]] = []
+        scales = weights_of_test(test, weighted=True)
+        for (record, std), (_, scale), seen in zip(records_of(test), scales, recovery, strict=False):
+            weights = separable(std, record.shape)
+            summed = SummedRecord(record, test.base, *weights, seen, self._series, static=bool(self._records))
+            self._records.append((summed, scale**2))
+            sizes.append((weights_of(record, std)[1], scale))
+        # Where less than this is left, lines are summed: the difference of large numbers that stands for the square has
+        # lost half of its digits there. A record that weighs more than the accelerations loses its digits earlier.
+        self._least = NEGLIGIBLE * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
+        self._pool = ThreadPoolExecutor(workers)
+        self._expansions: SimpleQueue[Batch] = SimpleQueue()  # one a thread
+        for _ in range(workers):
+            self._expansions.put(copy(batch))
+
+    def __call__(self, particles: Array, by_lines: Callable[[Array], Array]) -> Array:
+        """Of each candidate.
+
+        Parameters
+        ----------
+        particles : (count, n_variables)
+            Coordinates of the swarm.
+        by_lines : callable
+            The same summed over lines, for candidates near the records and those outside of the range of damping.
+        """
+        ends = chunk_ends(*particles.shape)
+        chunks = self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)
+        squared, inside = map(np.concatenate, zip(*chunks, strict=True))
+        held = np.logical_and(inside, squared > self._least)
+        if not np.all(held):
+            squared[~held] = by_lines(particles[~held]) / self._share
+        return self._share * squared
+
+    def _chunk(self, particles: Array, start: int, end: int) -> tuple[Array, Array]:
+        """Squares, and whether the ratios are within the range of the series."""
+        count = len(particles)
+        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last chunk is filled up
+        expansion = self._expansions.get()
+        ratios, *parts = expansion(full)
+        self._expansions.put(expansion)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            squared = self._squared(ratios[..., 0].T, batch_modes(*parts)[1])
+        return squared[: count - start], self._series.holds(ratios[: count - start, :, 0])
+
+    def _squared(self, ratios: Array, modes: BatchModes) -> Array:
+        polynomials, inner = self._series.polynomials(ratios), None
+        (accelerations, size), *of_force = self._records
+        squared = np.zeros(len(modes.loads))
+        for force, size_of_force in of_force:
+            shapes, loads = _of_force(modes)
+            of_all = force.inner(loads, polynomials)
+            squared += force.squared(shapes, loads, polynomials, of_all) / size_of_force
+            n = modes.shapes.shape[1]
+            inner = np.ascontiguousarray(of_all[:, :n, :n]) if accelerations.weighs_like(force) else None
+        return squared + accelerations.squared(modes.shapes, modes.loads, polynomials, inner) / size
+
+
+def chunk_ends(count: int, size: int) -> list[int]:
+    """Where chunks of candidates of this size end: an even number, nearly equal, the same for any number of threads.
+
+    >>> chunk_ends(781, 300), chunk_ends(3, 300)
+    ([192, 384, 576, 784], [16])
+    """
+    steps = math.ceil(count / CHUNK)
+    chunks = min(2 * math.ceil(count * size / (2 * _MOST)), steps)
+    ends = [CHUNK * (i * steps // chunks) for i in range(1, chunks)]
+    return [*ends, _STEP * math.ceil(count / _STEP)]
+
+
+def _range_of_ratios(problem: Prepared, expansion: Batch, count: int = 256) -> tuple[Array, Array]:
+    """Least and largest damping ratios (n,) of so many candidates: the ends of a swarm's box and draws between them.
+
+    Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
+    """
+    lower, upper = problem.formulation.box
+    draws = np.random.default_rng(0).uniform(lower, upper, (count - 2, problem.n_variables))
+    ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
+    lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)
+    highest = np.where(highest > 0, highest, 1.0)  # no ratio of a structure: all goes by lines
+    lowest = np.maximum(lowest, highest / _WIDEST_RANGE)
+    return lowest, np.maximum(highest, lowest * _NARROWEST_RANGE)
+
+
+def _of_force(modes: BatchModes) -> tuple[Array, Array]:
+    """Shapes and participations of the base force, with the rigid-body mass behind the modes."""
+    rigid = modes.rigid_body_mass
+    still = np.broadcast_to(np.eye(rigid.shape[1]), rigid.shape)
+    return np.concatenate([modes.loads, still], axis=1), np.concatenate([modes.loads, rigid], axis=1)
+
 
 WORST = 1e6  # an objective that no candidate passes that keeps the constraints
 

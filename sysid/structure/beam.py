@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
-from sysid.structure.axes import unit_vector
+from sysid.structure.sensor import unit_vector
 from sysid.structure.thresholds import NEGLIGIBLE
 
 Array = NDArray[np.float64]

@@ -23,7 +23,6 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
-from sysid.structure.axes import base_columns, rigid_motion, sensor_row, vector3
 from sysid.structure.beam import (
     SINGULAR,
     Array,
@@ -41,6 +40,7 @@ from sysid.structure.beam import (
     stiffness_patterns,
     symmetric,
 )
+from sysid.structure.sensor import base_columns, rigid_motion, sensor_row, vector3
 from sysid.structure.structure import Structure, shaped_array
 from sysid.structure.thresholds import EXACT
 

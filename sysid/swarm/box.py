@@ -1,4 +1,4 @@
-"""The search box: conversion between the caller's units and coordinates scaled to the range of each variable."""
+"""The search box: units scaled to the range of each variable, and points spread over it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, numbers
+
+
+def latin_hypercube(count: int, size: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Points (count, size): in each direction one in each of `count` slices.
+
+    The draws are those of ``scipy.stats.qmc.LatinHypercube``, whose import takes longer than many a fit.
+
+    References
+    ----------
+    M. D. McKay, R. J. Beckman, W. J. Conover, Technometrics 21 (1979) 239-245.
+    """
+    rng = rng.spawn(1)[0]
+    inside = rng.uniform(size=(count, size))
+    slices = np.tile(np.arange(1, count + 1), (size, 1))
+    for row in slices:
+        rng.shuffle(row)
+    return np.asarray((slices.T - inside) / count)
+
 
 FloatArray = NDArray[np.float64]
 

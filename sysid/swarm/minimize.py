@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, RandomSource, function, refuse, whole_number
 
 from .adaptation import EvolutionaryState
-from .checks import checked_costs, checked_rows
 from .particles import ParticleSwarm
-from .settings import SwarmSettings
+from .settings import SwarmSettings, checked_costs, checked_rows
 from .stop import StopReason, StopRules
 
 if TYPE_CHECKING:

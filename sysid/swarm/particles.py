@@ -13,10 +13,8 @@ from sysid.errors import InputError, RandomSource, instance, random_generator, w
 
 from . import adaptation
 from .adaptation import EvolutionaryState
-from .box import Box
-from .checks import checked_costs, checked_rows
-from .sampling import latin_hypercube
-from .settings import SwarmSettings
+from .box import Box, latin_hypercube
+from .settings import SwarmSettings, checked_costs, checked_rows
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from benchmarks.records.simulated import Records, four_storeys, with_noise
-from sysid.modal_analysis.record_poles import steady_sine
+from sysid.modal_analysis.rough_poles import steady_sine
 
 SETTING = four_storeys()
 RATE = SETTING.sample_rate

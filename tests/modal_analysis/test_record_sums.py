@@ -4,7 +4,7 @@ import pytest
 import sysid
 from sysid.modal_analysis.record_fit import on_all_lines, record_modes, refitted
 from sysid.modal_analysis.record_model import Chunk, RecordModel
-from sysid.modal_analysis.record_poles import decimated_lines
+from sysid.modal_analysis.rough_poles import decimated_lines
 
 RATE, SAMPLES = 40.0, 400
 

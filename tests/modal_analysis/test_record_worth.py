@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.model_order import peaks_of, trials_of
+from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
-from sysid.modal_analysis.record_more import peaks_of, trials_of
-from sysid.modal_analysis.record_noise import ErrorSpectra, _likelihood
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths

@@ -3,7 +3,7 @@
 import numpy as np
 
 import sysid
-from sysid.problem.batch_modes import batch_modes
+from sysid.problem.batch import batch_modes
 
 N, D = 4, 2
 G = np.array([[1.0, 0.0], [0.0, 1.0], [0.6, 0.8], [1.0, 0.0]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.problem.batch_response import by_lines, by_states
+from sysid.problem.batch import by_lines, by_states
 
 FREQ = np.linspace(0.0, 12.0, 25)
 

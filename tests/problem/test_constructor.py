@@ -9,7 +9,7 @@ import pytest
 import sysid
 from sysid.modal_analysis import modal_estimate
 from sysid.problem import formulation, given
-from sysid.swarm import sampling
+from sysid.swarm import box
 
 SPRINGS = np.array([2e4, 1.5e4, 1e4])
 FREQ = np.linspace(1.0, 30.0, 60)
@@ -71,7 +71,7 @@ def calls(monkeypatch):
     counted(formulation, "noise_level")
     counted(given, "weighed_mass")
     counted(ca, "nlpsol")
-    counted(sampling, "latin_hypercube")
+    counted(box, "latin_hypercube")
     return ran
 
 

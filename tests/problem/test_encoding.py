@@ -14,7 +14,7 @@ from sysid.files.tree import from_bytes, to_bytes
 from sysid.problem import operations
 from sysid.problem.decoding import decode
 from sysid.problem.encoding import NotStorableError, encode
-from sysid.problem.serialised import is_compiled
+from sysid.problem.operations import is_compiled
 
 X, Y, A, L = (
     ca.MX.sym("x", 3), ca.MX.sym("y", 3), ca.MX.sym("A", 3, 3), ca.MX.sym("L", ca.Sparsity.lower(3)),

@@ -10,7 +10,7 @@ import pytest
 import sysid
 from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
 from sysid.models.spectrum import nearest_factors
-from sysid.problem import batch_objective
+from sysid.problem import batch as candidates
 from sysid.structure.triangular import triangle, triangle_entries
 
 SEEDS = range(3)
@@ -112,7 +112,7 @@ def test_bits_do_not_depend_on_the_batch_or_the_threads(random_case, monkeypatch
     rows = sampled(problem, particles(rng, problem, 200))
     whole = problem.formulation.own_test.squared(rows)
     for threads in (1, 3):
-        monkeypatch.setattr(batch_objective, "_THREADS", threads)
+        monkeypatch.setattr(candidates, "_THREADS", threads)
         term = problem.prepared.formulate(problem.geometry).own_test
         np.testing.assert_array_equal(term.squared(rows), whole)
     for count in (1, 63, 64, 65, 127, 129, 200):

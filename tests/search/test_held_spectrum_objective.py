@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.search.held_spectrum_objective import HeldSpectrumObjective, chunk_ends
-from sysid.search.swarm_objective import SwarmObjective
+from sysid.search.swarm_objective import HeldSpectrumObjective, SwarmObjective, chunk_ends
 
 N, D = 5, 2
 FREQ = np.linspace(1.0, 25.0, 60)

@@ -13,8 +13,7 @@ import pytest
 
 import sysid
 from sysid.search import other_answers
-from sysid.search.batch_least_squares import LeastSquares
-from sysid.search.same_response import SameResponse
+from sysid.search.other_answers import LeastSquares, SameResponse
 
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])

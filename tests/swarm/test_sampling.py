@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from sysid.swarm.sampling import latin_hypercube
+from sysid.swarm.box import latin_hypercube
 
 
 @pytest.mark.parametrize(("count", "size"), [(7, 3), (1, 1)])

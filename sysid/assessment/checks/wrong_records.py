@@ -17,7 +17,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
-from sysid.modal_analysis.record_poles import poles_of_test
+from sysid.modal_analysis.rough_poles import poles_of_test
 from sysid.problem.feasibility import points_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared

@@ -15,8 +15,8 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.modal_analysis.modal_estimate import Excess
+from sysid.modal_analysis.noise_levels import NO_NOISE
 from sysid.modal_analysis.record_fit import RecordFit
-from sysid.modal_analysis.record_noise import NO_NOISE
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import FALSE_ALARM
 

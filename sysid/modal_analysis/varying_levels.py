@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import VaryingLevel
+from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_fit import RecordFit, refitted
-from sysid.modal_analysis.record_noise import NO_NOISE, level_deviations, likeliest_levels
-from sysid.modal_analysis.record_whiteness import excess_of
+from sysid.modal_analysis.whiteness_test import excess_of
 
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
 
