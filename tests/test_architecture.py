@@ -26,11 +26,12 @@ CEILINGS = {
     # by checks that share one context (600), a page of half the size and time (140),
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530);
     # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340),
-    # and fits that end when they are asked to, with the best so far, which results hold (400).
-    "lines": 42_272,
+    # and fits that end when they are asked to, with the best so far, which results hold (400),
+    # and transients of runs eliminated run by run, noise levels and further modes of low rank (210).
+    "lines": 42_482,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.0,
-    "files": 258,
+    "files": 227,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
