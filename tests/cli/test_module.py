@@ -6,7 +6,7 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
-from sysid.report import matrices, report
+from sysid.report import report
 
 MODULE = '''
 """Two storeys; their stiffness is a class of this module."""
@@ -46,8 +46,8 @@ def run(tmp_path_factory):
     module = folder / "storeys.py"
     module.write_text(MODULE, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
-        for room in (report, matrices):  # the pictures take longest, and need no problem
-            patch.setattr(room, "picture", lambda figure, alt, caption="", **_: f"<p>{caption}</p>")
+        # The pictures take longest, and need no problem.
+        patch.setattr(report, "picture", lambda figure, alt, caption="", **_: f"<p>{caption}</p>")
         yield _run(folder, module)
 
 
