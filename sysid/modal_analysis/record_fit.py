@@ -280,7 +280,7 @@ def _minimise(
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: _chi2(model, trial, levels),
-        lambda at: equations(at, levels),
+        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels),
     )  # fmt: skip
     return minimise(problem, tell, most, lambda _: _SETTLED)
 
@@ -305,6 +305,10 @@ class _Equations:
         if self.of_matrix is not self.model:
             equations = self.model.gradient(p, levels)
         return equations._replace(normal=self.normal)
+
+    def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
+        """The same with the matrix of these very parameters; None where it was."""
+        return None if self.at is not None and self.at[0] is p else self(p, levels, near=0.0)
 
 
 def _moved(modes: Modes, other: Modes) -> float:
