@@ -27,12 +27,15 @@ class SumOfSquares:
         The sum of squares at parameters; infinite where there is none.
     equations : callable
         Normal equations at parameters, by the unknowns.
+    renewed : callable
+        The same where their matrix was that of other parameters close by, else None: asked for where a step fails.
     """
 
     start: Array
     unpack: Callable[[Array], Parameters]
     chi2: Callable[[Parameters], float]
     equations: Callable[[Parameters], NormalEquations]
+    renewed: Callable[[Parameters], NormalEquations | None] = lambda _: None
 
 
 def minimise(
@@ -60,16 +63,19 @@ def minimise(
         here = problem.equations(p)
         if tell(i, p, here.chi2):
             return p, here.chi2, False
-        unit = units_of(here.normal)
-        scaled = here.normal * np.outer(unit, unit)
         enough = settled(here.chi2)
         while True:
+            unit = units_of(here.normal)
+            scaled = here.normal * np.outer(unit, unit)
             step = _step(scaled, damping, here.gradient * unit) * unit
             promised = float(here.gradient @ step)
             trial = problem.unpack(x + step)
             after = problem.chi2(trial)
             if after <= here.chi2 or promised < enough:
                 break
+            if (renewed := problem.renewed(p)) is not None:
+                here = renewed
+                continue
             damping = max(10 * damping, _DAMPING[1])
             if damping > greatest:
                 return p, here.chi2, False

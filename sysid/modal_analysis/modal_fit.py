@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -87,11 +88,13 @@ def held_gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray
 
     Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they
     leave every mixture open, and the block in as many directions is held to a unit matrix; a force leaves only
-    rotations of these modes into each other, and the block is held triangular.
+    rotations of these modes into each other, and the block is held triangular. More modes at a pole than directions, as
+    where a guess has them all at one, are held in blocks of so many.
     """
     gauge, held = first.gamma / unit, np.zeros(first.gamma.shape, dtype=bool)
     _, start = np.unique(first.omega + 1j * first.ratios, return_index=True)
-    for same in np.split(np.arange(first.omega.size), np.sort(start)[1:]):
+    at_poles = np.split(np.arange(first.omega.size), np.sort(start)[1:])
+    for same in chain.from_iterable(np.split(one, range(unit.size, one.size, unit.size)) for one in at_poles):
         pivots = scipy.linalg.qr(gauge[same], pivoting=True, mode="r")[1]  # directions best conditioned together first
         block = np.ix_(same, pivots[: same.size])
         if weighed:

@@ -128,6 +128,14 @@ class SpectralModel:
         """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
         return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
 
+    def trial_chi2(self, p: Parameters, levels: Array) -> float:
+        """The same of a step's end; infinite where it went beyond all measure."""
+        if not np.all(np.isfinite(p.modes.omega)) or np.any(p.modes.ratios >= 1.0):
+            return np.inf
+        with np.errstate(over="ignore"):
+            value = self.chi2(p, levels)
+        return value if np.isfinite(value) else np.inf
+
 
 class Lines:
     """Some lines of one run at given parameters."""

@@ -279,8 +279,8 @@ def _minimise(
         return False
 
     problem = SumOfSquares(
-        model.pack(p), model.unpack, lambda trial: _chi2(model, trial, levels),
-        lambda at: equations(at, levels),
+        model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
+        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels),
     )  # fmt: skip
     return minimise(problem, tell, most, lambda _: _SETTLED)
 
@@ -305,6 +305,10 @@ class _Equations:
         if self.of_matrix is not self.model:
             equations = self.model.gradient(p, levels)
         return equations._replace(normal=self.normal)
+
+    def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
+        """The same with the matrix of these very parameters; None where it was."""
+        return None if self.at is not None and self.at[0] is p else self(p, levels, near=0.0)
 
 
 def _moved(modes: Modes, other: Modes) -> float:
@@ -338,13 +342,6 @@ def half_inverse(normal: Array, least: float) -> Array:
     lam, V = np.linalg.eigh(normal)
     seen = lam > least * lam.max(initial=0.0)
     return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
-
-
-def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
-    """The sum of squares; infinite where a step went beyond all measure."""
-    good = np.all(np.isfinite(p.modes.omega)) and np.all(p.modes.ratios < 1.0)
-    value = model.chi2(p, levels) if good else np.inf
-    return value if np.isfinite(value) else np.inf
 
 
 def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:

@@ -277,13 +277,8 @@ def fit_spectra(
     def tell(_: int, p: Parameters, chi2: float) -> bool:
         return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)
 
-    def chi2_of(p: Parameters) -> float:
-        good = np.all(np.isfinite(p.modes.omega)) and np.all(p.modes.ratios < 1.0)
-        value = model.chi2(p, model.levels) if good else np.inf
-        return value if np.isfinite(value) else np.inf
-
     problem = SumOfSquares(
-        model.pack(model.with_best_shapes(first, rigid)), model.unpack, chi2_of,
+        model.pack(model.with_best_shapes(first, rigid)), model.unpack, lambda p: model.trial_chi2(p, model.levels),
         lambda p: model.normal_equations(p, model.levels),
     )  # fmt: skip
     # Far below the noise, so that IPOPT finds its tolerance met where it begins.

@@ -235,3 +235,11 @@ def test_time_over_before_there_is_any_structure_is_an_error_of_the_search(monke
     problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
     with pytest.raises(sysid.SolverError, match="the time was over: nothing is identified"):
         sysid.identify(problem, strategy="continuation", rng=0)
+
+
+def test_a_guess_with_all_modes_at_one_pole_is_a_start_like_any_other():
+    """Of a full mass and a free stiffness: more modes at the pole than there are base directions."""
+    test = measured(noise=0.01, force=True)
+    found = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="continuation", rng=0)
+    assert found.success
+    assert found.residual < 1.05 * test.residual(two_floors())

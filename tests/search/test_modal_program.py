@@ -353,6 +353,18 @@ def test_modes_that_share_a_pole_start_turned_into_each_other_where_a_force_weig
     np.testing.assert_array_equal(gauge[held], 0.0)
 
 
+@pytest.mark.parametrize("weighed", [False, True])
+def test_more_modes_at_a_pole_than_directions_are_held_in_blocks(weighed):
+    """As where a guess has them all at one: five modes, two directions."""
+    gamma = np.random.default_rng(0).normal(size=(5, 2))
+    gauge, held = held_gauge(Modes(np.eye(5), gamma, np.full(5, 9.0), np.full(5, 0.01)), np.ones(2), weighed)
+    for block in (slice(0, 2), slice(2, 4), slice(4, 5)):
+        alone = Modes(np.eye(5)[:, block], gamma[block], np.full(5, 9.0)[block], np.full(5, 0.01)[block])
+        expected, where = held_gauge(alone, np.ones(2), weighed)
+        np.testing.assert_allclose(gauge[block], expected, atol=1e-12)
+        np.testing.assert_array_equal(held[block], where)
+
+
 def test_residues_of_rank_one_are_split_into_shapes_of_any_size():
     rng = np.random.default_rng(0)
     phi, gamma, size = rng.normal(size=(4, 3)), rng.normal(size=(3, 2)), rng.uniform(0.1, 9, 3)
