@@ -154,7 +154,8 @@ def _accused(problem: sysid.Problem, seed: int, clock: Callable[[], float]) -> t
         result = sysid.identify(problem, rng=seed)
     finally:
         judgement.with_other_answers = look
-    return bool(result.of_kind("other answers")), clock() - begun, min(looked, default=0.0)
+    seconds, least = clock() - begun, min(looked, default=0.0)
+    return bool(result.of_kind("other answers")), seconds - sum(looked) + least, least
 
 
 def _of_module(name: str) -> Callable[[int], sysid.Problem]:
