@@ -3,9 +3,12 @@
 from sysid.cli import starting as _starting  # noqa: F401 - first: what follows takes a sixth of a second
 
 # isort: split
+import importlib as _importlib
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
+
 import casadi as _casadi
 
-from sysid import jobs, plot
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.export.export import export
 from sysid.files.reading import read
@@ -23,7 +26,6 @@ from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior
-from sysid.report.report import write_report
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.continuation import Continuation
@@ -37,6 +39,25 @@ from sysid.swarm import SwarmSettings, minimize_swarm
 # CasADi 3.8 warns once about its coming NumPy conventions unless one is chosen.
 if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
     _casadi.GlobalOptions.setNumpyMode(-1)  # as it always was, without the warning
+
+if _TYPE_CHECKING:
+    from sysid import jobs, plot
+    from sysid.report.report import write_report
+
+_FIRST_USED = {"jobs": "sysid.jobs", "plot": "sysid.plot", "write_report": "sysid.report.report"}
+
+
+def __getattr__(name: str) -> _Any:
+    """Import what takes long to import, and many sessions do without, where it is first asked for."""
+    if name not in _FIRST_USED:
+        raise AttributeError(f"module 'sysid' has no attribute {name!r}")
+    module = _importlib.import_module(_FIRST_USED[name])
+    return getattr(module, name, module)
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",

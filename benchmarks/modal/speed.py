@@ -10,11 +10,11 @@ from threadpoolctl import threadpool_limits
 
 import sysid
 from benchmarks.line import Line, below
+from benchmarks.machine import at_full_speed, fixed_work
 from benchmarks.modal.identification import identify_records
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 
 SECONDS = {10: 0.3, 20: 2.0}  # bounds on the medians, by the number of modes
-PEER = 0.1  # s that `_peer` takes where a machine of this kind is at its full speed
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -22,7 +22,7 @@ def lines(reduced: bool) -> Iterator[Line]:
 
     Of each structure the least of so many rounds counts: what others do on the machine still takes its caches. The
     reduced form has more rounds of the quick tests, as slow spells of a shared machine last for some ten seconds. A
-    machine can be slow for hours: the reduced form judges seconds at the speed at which fixed work beside takes `PEER`.
+    machine can be slow for hours: the reduced form judges seconds at full speed, as fixed work beside tells it.
     """
     count = 3 if reduced else 10
     directions: dict[str, int | None] = {"d = 3": 3} if reduced else {"d = 3": 3, "d = 1 to 3": None}
@@ -39,7 +39,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             for _ in range(rounds):
                 taken.append([[_seconds(test) for test in group] for group in tests.values()])
                 if reduced:
-                    beside.append(_peer())
+                    beside.append(fixed_work())
         medians = np.median(np.min(taken, axis=0), axis=1)
         shown = "; ".join(f"{kind} {value:.2f}" for kind, value in zip(tests, medians, strict=True))
         what = f"largest median over {count} structures, least of {rounds}, processor s"
@@ -48,9 +48,8 @@ def lines(reduced: bool) -> Iterator[Line]:
             yield below(name, float(medians.max()), bound)
             continue
         yield Line(name, f"{medians.max():.3g}")
-        slow = min(beside) / PEER
-        text = f"n = {n}: the same at the speed at which fixed work takes {PEER:g} s, here {min(beside):.3g} s"
-        yield below(text, float(medians.max()) / slow, bound)
+        text, seconds = at_full_speed(float(medians.max()), min(beside))
+        yield below(f"n = {n}: the same {text}", seconds, bound)
 
 
 def _seconds(test: sysid.Measurement) -> float:
@@ -59,18 +58,6 @@ def _seconds(test: sysid.Measurement) -> float:
         identify_records(test)
     except Exception:
         return np.inf  # no answer is not a fast answer
-    return time.process_time() - begun
-
-
-def _peer() -> float:
-    """Processor seconds of fixed work, half of it Python's and half LAPACK's, as in an identification."""
-    matrix = np.random.default_rng(0).normal(size=(1240, 41))
-    begun = time.process_time()
-    total = 0
-    for i in range(10**6):
-        total += i
-    for _ in range(100):
-        np.linalg.qr(matrix, mode="r")
     return time.process_time() - begun
 
 
