@@ -275,7 +275,7 @@ def _settled(
     size = omega.size + 1
     while 0 < omega.size < size:
         size = omega.size
-        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity, most_damped=DAMPED)
+        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity)
         omega, ratios = _prune(records, omega, ratios, progress, velocity=velocity)
     return omega, ratios
 
@@ -350,19 +350,9 @@ def _prune(
 
 
 def _polish(
-    records: Records,
-    omega: Array,
-    ratios: Array,
-    progress: _Progress,
-    *,
-    velocity: bool = False,
-    most_damped: float = np.inf,
-    steps: int = 100,
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
-    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated.
-
-    They end where a pole is damped more than `most_damped`: it is to be removed, and the others may move then.
-    """
+    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
@@ -376,7 +366,7 @@ def _polish(
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial, velocity)
         if lower < error:
-            done = error - lower < NEGLIGIBLE * error or bool(np.any(trial[m:] >= np.log(most_damped)))
+            done = error - lower < NEGLIGIBLE * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break
