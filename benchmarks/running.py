@@ -66,6 +66,7 @@ def write_test(folder: Path) -> None:
 def running_files(folder: Path) -> list[str]:
     """Files below ``sysid/`` in which a function ran, the imports' own code apart."""
     import sysid
+    import sysid.report.report  # else bodies of its classes run, as it is imported where it is first used
     from sysid.cli.main import main
 
     package = str(Path(sysid.__file__).parent)
