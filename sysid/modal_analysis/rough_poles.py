@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 _BESIDE = 3  # lines about that of a sine that is cut within a cycle, with most of its power
 
@@ -68,10 +69,10 @@ def steady_sine(test: Measurement) -> str | None:
 
 
 def at_sines_alone(test: Measurement, omega: Array) -> bool:
-    """True where the base moves in steady sines, and no mode, rad/s, lies within the lines away from them."""
+    """True where the base moves in steady sines, and no other line or mode, rad/s, away from them tells anything."""
     found, f = _sines(test), omega / (2 * np.pi)
-    if found is None:
-        return False
+    if found is None or _sines(test, share=1 - ROUND_OFF) is not None:  # at other lines the base does not move
+        return found is not None
     spacing = np.max(np.diff(test.freq))
     inside = (f > test.freq[0]) & (f < test.freq[-1])
     return not np.any(inside & np.all([np.abs(f - sine) > _BESIDE * spacing for sine in found], axis=0))

@@ -342,7 +342,7 @@ def _fit(problem: Prepared, x: Array, session: Session) -> Array:
     """The records fitted from a point that answers nearly as they do, so that its fit is near, if it has one."""
     monitor = session.reporter("other answers")
     try:
-        end = local.solve(problem, x, max_iterations=100, max_time=session.left, monitor=monitor)
+        end = local.solve(problem, x, max_iterations=50, max_time=session.left, monitor=monitor)
     except InputError:  # of no structure
         return x
     if end.stopped is not None:
