@@ -22,5 +22,6 @@ def fixed_work() -> float:
 
 
 def at_full_speed(seconds: float, beside: float) -> tuple[str, float]:
-    """Words for, and seconds of, what took so long beside fixed work that took `beside`, were that `PEER`."""
-    return f"at the speed at which fixed work takes {PEER:g} s, here {beside:.3g} s", seconds * PEER / beside
+    """Words for, and seconds of, what took so long beside fixed work that took `beside`, were that `PEER` at most."""
+    words = f"at the speed at which fixed work takes {PEER:g} s at most, here {beside:.3g} s"
+    return words, seconds * PEER / max(beside, PEER)
