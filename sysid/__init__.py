@@ -15,7 +15,6 @@ from sysid.files.reading import read
 from sysid.identify import identify
 from sysid.measurement.in_time import TimeScores, time_scores
 from sysid.measurement.measurement import Measurement, Sensor
-from sysid.measurement.rigid_body import rigid_body
 from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
 from sysid.measurement.whole import NoiseLevels
@@ -33,6 +32,7 @@ from sysid.search.modal import Modal
 from sysid.search.session import Progress
 from sysid.search.strategy import History
 from sysid.search.swarm import Swarm
+from sysid.structure.sensor import rigid_body
 from sysid.structure.structure import Structure
 from sysid.swarm import SwarmSettings, minimize_swarm
 

@@ -22,9 +22,9 @@ from pathlib import Path
 from types import ModuleType
 
 from sysid.errors import InputError
-from sysid.models.registry import BESIDE, PROBLEM_MODULE
 from sysid.models.unknowns import NO_COMPLEX, NO_TRUTH, declared
 from sysid.problem.problem import Problem
+from sysid.problem.stored import BESIDE, PROBLEM_MODULE
 from sysid.results.identification import Recipe
 
 _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"

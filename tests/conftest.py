@@ -15,7 +15,7 @@ import pytest
 
 import sysid
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.models.geometry import Geometry
+from sysid.models.model import Geometry
 
 
 def _import_benchmarks():

@@ -17,8 +17,8 @@ from benchmarks.problem_modules import load_module
 from benchmarks.swarm import controls
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import weighted_error
-from sysid.models.geometry import Geometry
 from sysid.models.mass import total_of
+from sysid.models.model import Geometry
 
 SEEDS = range(9200, 9220)
 WITHOUT = 5  # seeds that are searched without a swarm too, in the full form: with all restarts they take the longest

@@ -28,9 +28,9 @@ from sysid.assessment.uncertainty import LARGE, uncertainty
 from sysid.errors import MOST_LISTED, InputError
 from sysid.finding import Finding, Severity, cautions
 from sysid.models.unknowns import scales_of, split
+from sysid.problem.direct_response import Slopes, slopes_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER, most_deviations
 

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes, force_columns, mode_of_slopes
 from sysid.modal_analysis.response import columns, gains, gains_and_slopes, motion_and_slopes
-from sysid.problem.slopes import Slopes, response_slopes
+from sysid.problem.direct_response import Slopes, response_slopes
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 

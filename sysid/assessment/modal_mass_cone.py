@@ -21,8 +21,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, gains
-from sysid.models.geometry import Geometry
-from sysid.models.model import Stated
+from sysid.models.model import Geometry, Stated
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure

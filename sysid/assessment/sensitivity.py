@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from sysid.assessment.information import Parametrisation
 from sysid.errors import listed
 from sysid.modal_analysis.modal_fit import Index, Modes
-from sysid.models.geometry import Geometry
+from sysid.models.model import Geometry
 from sysid.models.unknowns import Unknown, scales_of, split
+from sysid.problem.direct_response import Rows, Slopes, stacked_rows
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.problem.slopes import Rows, Slopes, stacked_rows
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 

@@ -44,9 +44,9 @@ from sysid.modal_analysis.modal_estimate import independent_rows, information_ab
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
+from sysid.problem.direct_response import Slopes, rows_of_test, slopes_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.problem.slopes import Slopes, rows_of_test, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 from sysid.structure.thresholds import NEGLIGIBLE
 

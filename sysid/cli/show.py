@@ -23,10 +23,9 @@ from sysid.identify import identify
 from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
-from sysid.problem.feasibility import HELD, LOOSE, points_of
-from sysid.problem.prepared import Prepared
+from sysid.problem.direct_response import Slopes, slopes_of
+from sysid.problem.prepared import HELD, LOOSE, Prepared, points_of
 from sysid.problem.problem import Problem
-from sysid.problem.slopes import Slopes, slopes_of
 from sysid.results.summary import WIDTH
 from sysid.results.tables import counted, in_columns
 from sysid.search.auto import choose

@@ -14,8 +14,7 @@ import numpy as np
 from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.rigid_body import rigid_body
-from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, sensors_from_tree, sensors_to_tree
+from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
 
 _FORMAT = 1

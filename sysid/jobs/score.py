@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.assessment.sensitivity import sensitivity
-from sysid.measurement.noise import raised
+from sysid.measurement.whole import raised
 from sysid.modal_analysis import outliers
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.results.identification import Identification

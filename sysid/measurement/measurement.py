@@ -11,11 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, choice, finite_array, refuse, sequence, whole_number
 from sysid.measurement import spectra
-from sysid.measurement.missing import Missing, complete, named, present
-from sysid.measurement.noise import levels_at_rest
-from sysid.measurement.rigid_body import axis_vector, check_axes, motion_of_sensors
-from sysid.measurement.whole import NoiseLevels, WholeRecords, check_cuts, check_options, per_run
-from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, checked_sensors, sensors_from_tree, sensors_to_tree
+from sysid.measurement.spectra import Missing, complete, named, present
+from sysid.measurement.whole import NoiseLevels, WholeRecords, check_cuts, check_options, levels_at_rest, per_run
+from sysid.structure.sensor import (
+    BASE_AXES,
+    Sensor,
+    axis_vector,
+    base_columns,
+    check_axes,
+    checked_sensors,
+    motion_of_sensors,
+    sensors_from_tree,
+    sensors_to_tree,
+)
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
 
 _FOLDED = 0.4  # of the sample rate; whole records are fitted up to it

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, stacked
 from sysid.structure.structure import Array, ComplexArray, Structure

@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.modal_analysis.pole_functions import Basis, Beside, OfRun, PoleFunctions, orthonormal, unit_columns
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 

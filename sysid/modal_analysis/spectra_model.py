@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise
 from sysid.modal_analysis.modal_fit import (
     ModalFit,

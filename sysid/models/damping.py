@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, as_float, finite_array, shown
 from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
-from sysid.models.geometry import Geometry
-from sysid.models.model import FieldTree, MassBlocks, Stated, StiffnessBlocks, Written
+from sysid.models.model import FieldTree, Geometry, MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
 

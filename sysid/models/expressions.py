@@ -1,4 +1,4 @@
-"""Matrices written in variables: what a user gives brought to CasADi expressions, and checked."""
+"""Matrices as CasADi expressions: what a user gives, brought to them and checked, and triangles from their entries."""
 
 from __future__ import annotations
 
@@ -163,3 +163,27 @@ def check_base_last(name: str, numbers: Array, n: int) -> None:
 def size_of(matrix: ca.MX) -> str:
     """The size of a matrix in words."""
     return f"{matrix.size1()} x {matrix.size2()}"
+
+
+def lower_triangle(entries: ca.SX | ca.MX, size: int) -> ca.SX | ca.MX:
+    """Lower-triangular expression from its entries, row by row."""
+    rows, columns = np.tril_indices(size)
+    return type(entries)(ca.Sparsity.lower(size), entries[np.lexsort((rows, columns)).tolist()])
+
+
+def lower_entries(matrix: ca.SX | ca.MX) -> ca.SX | ca.MX:
+    """Entries of an expression's lower triangle, row by row."""
+    rows, columns = np.tril_indices(matrix.size1())
+    return ca.vec(ca.densify(matrix))[(columns * matrix.size1() + rows).tolist()]
+
+
+def triangle(entries: Array, size: int) -> Array:
+    """Lower-triangular matrix of numbers from its entries, row by row."""
+    matrix = np.zeros((size, size))
+    matrix[np.tril_indices(size)] = entries
+    return matrix
+
+
+def triangle_entries(matrix: Array) -> Array:
+    """Entries of a matrix's lower triangle, row by row."""
+    return matrix[np.tril_indices(len(matrix))]

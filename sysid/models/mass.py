@@ -10,13 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
-from sysid.models.expressions import at_point, check_base_last
-from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
-from sysid.models.model import FactoredMass, FieldTree, MassBlocks, Stated, Totals, Written, constant
+from sysid.models.expressions import at_point, check_base_last, lower_triangle, triangle_entries
+from sysid.models.model import (
+    FACTOR_FLOOR,
+    FactoredMass,
+    FieldTree,
+    Geometry,
+    MassBlocks,
+    Stated,
+    Totals,
+    Written,
+    check_sane,
+    check_total_mass,
+    constant,
+)
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, lowest_eigenvalue
 from sysid.structure.thresholds import ROUND_OFF
-from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
 def sampling_exponent(k: int, c: float = 1.0) -> float:

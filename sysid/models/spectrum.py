@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.models.expressions import triangle, triangle_entries
 from sysid.nlp import quiet_options
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
-from sysid.structure.triangular import triangle, triangle_entries
 
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
 

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, finite_array, refuse
-from sysid.models.expressions import at_point, written_in
-from sysid.models.geometry import FACTOR_FLOOR, Geometry
-from sysid.models.model import FieldTree, MassBlocks, Stated, StiffnessBlocks, Written
+from sysid.models.expressions import at_point, lower_triangle, triangle_entries, written_in
+from sysid.models.model import FACTOR_FLOOR, FieldTree, Geometry, MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.spectrum import by_ipopt, nearest_factors
 from sysid.models.unknowns import Unknown, log_sampling, user_site
 from sysid.structure.structure import Array, Structure
-from sysid.structure.triangular import lower_triangle, triangle_entries
 
 FREQUENCY_WINDOW = 0.05  # relative; what a stated frequency, read off a peak, may be wrong by
 

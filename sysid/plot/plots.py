@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.rigid_body import axis_vector
 from sysid.modal_analysis.outliers import HUBER
 from sysid.plot.canvas import (
     COLOURS,
@@ -43,6 +42,7 @@ from sysid.plot.panels import (
 )  # fmt: skip
 from sysid.results.identification import Identification
 from sysid.results.tables import counted
+from sysid.structure.sensor import axis_vector
 from sysid.structure.structure import Array
 
 if TYPE_CHECKING:

@@ -17,18 +17,75 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import refuse
+from sysid.errors import InputError, refuse
 from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.expressions import as_matrix, variables_of, written_in
-from sysid.models.geometry import Geometry
-from sysid.models.model import MatrixModel, Stated, ratios_of
-from sysid.models.unknowns import Unknown, Variable, box_of, lower_of, split, upper_of
-from sysid.problem.constraints import ConstraintRow, Constraints, constraint_row
-from sysid.problem.given import MATRICES
-from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
-from sysid.problem.terms import Builder, ExpressionTerm, FurtherTest, Prior, Residual, Term, TermSource, TestTerm
+from sysid.models.model import Geometry, MatrixModel, Stated, ratios_of
+from sysid.models.unknowns import Unknown, Variable, box_of, expression_of, lower_of, split, upper_of, user_site
+from sysid.problem.matrices import MATRICES, Blocks, Matrices, blocks_of, symbols_in
+from sysid.problem.terms import (
+    Builder,
+    ExpressionTerm,
+    FurtherTest,
+    Prior,
+    Residual,
+    Term,
+    TermSource,
+    TestTerm,
+    column_of,
+)
 from sysid.structure.structure import Array, Structure
+
+
+class Constraints(NamedTuple):
+    """``lower <= function(x) <= upper``; `sources` names the constraint of each row, and its variables.
+
+    Without constraints it has no rows.
+    """
+
+    function: ca.Function
+    lower: Array
+    upper: Array
+    sources: tuple[str, ...]
+
+    @property
+    def equal(self) -> Array:
+        """Which rows are equalities, (rows,)."""
+        return self.lower == self.upper
+
+    def at(self, x: Array) -> Array:
+        """Values at `x`, (rows,)."""
+        return np.asarray(self.function(x)).ravel()
+
+    def violation(self, x: Array) -> Array:
+        """By how much they leave their bounds at `x`, (rows,)."""
+        values = self.at(x)
+        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+
+
+class ConstraintRow(NamedTuple):
+    """A constraint ``lower <= expression <= 0``, an equality where `lower` is 0, and what messages call it."""
+
+    expression: ca.MX
+    lower: float
+    source: str
+
+
+def constraint_row(number: int, value: Any) -> ConstraintRow:
+    """The row of a constraint that was given."""
+    relation = expression_of(value)
+    name = f"constraint {number}"
+    kinds = {ca.OP_LE: -np.inf, ca.OP_LT: -np.inf, ca.OP_EQ: 0.0}
+    lower = next((low for k, low in kinds.items() if isinstance(relation, ca.MX) and relation.is_op(k)), None)
+    if lower is None:
+        what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
+        raise InputError(
+            f"{name} is {what} ({user_site()}): a constraint is a relation of variables, such as "
+            f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
+        )
+    row = column_of(name, relation.dep(0) - relation.dep(1))
+    return ConstraintRow(row, lower, name + written_in(relation, ","))
 
 
 class Parts(NamedTuple):
@@ -424,19 +481,9 @@ def _check_names(unknowns: Sequence[Unknown]) -> None:
     first: dict[str, Unknown] = {}
     for unknown in unknowns:
         same = first.setdefault(unknown.name, unknown)
-        twice = same is not unknown
-        there, here = (getattr(u, "declared", None) for u in (same, unknown))  # None for a model's
-        refuse(
-            (twice and here is None, f"two matrix models have unknowns called {unknown.name!r}: rename those of one"),
-            (
-                twice and there is None,
-                f"variable {unknown.name!r} ({here}) has the name of a model's unknowns: rename it",
-            ),
-            (
-                twice,
-                f"two variables are called {unknown.name!r} ({there}; {here}): tables and results need a name each",
-            ),
-        )
+        if same is not unknown:
+            there, here = (getattr(u, "declared", "of a matrix model") for u in (same, unknown))
+            raise InputError(f"two unknowns are called {unknown.name!r} ({there}; {here}): rename one of them")
 
 
 def _check_healing(healed: Mapping[Variable, ca.MX], free: Sequence[Unknown]) -> None:

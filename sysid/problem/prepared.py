@@ -1,4 +1,4 @@
-"""A problem as it is searched: its records with what they tell of the modes, and the least-squares problem of both."""
+"""A problem as it is searched: records, modes and the least-squares problem; checks that it can be searched at all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Any
 
+import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, Stop
@@ -19,14 +21,115 @@ from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_v
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
 from sysid.modal_analysis.vector_fitting import Poles
-from sysid.models.geometry import Geometry
+from sysid.models.model import Geometry
 from sysid.models.unknowns import Unknown
-from sysid.nlp import IterationMonitor
-from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of
+from sysid.nlp import IterationMonitor, quiet_options
 from sysid.problem.formulation import Formulation
-from sysid.problem.given import MATRICES, geometry_of, rough_mass
+from sysid.problem.matrices import MATRICES, geometry_of, rough_mass
 from sysid.problem.stated import StatedProblem
 from sysid.structure.structure import Array, Structure
+from sysid.swarm import box
+
+HELD = 1e-6  # of a constraint's scale: what counts as satisfied
+LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
+
+
+def points_of(formulation: Formulation, count: int = 128) -> Array:
+    """The guess, and points spread over the search space, (count, size)."""
+    return np.array([formulation.guess, *spread_points(formulation, count - 1, np.random.default_rng(0))])
+
+
+def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
+    """Points spread over the search space as the swarm's are."""
+    unit = box.latin_hypercube(count, formulation.size, rng)
+    low, high = formulation.box
+    rows = low + unit * (high - low)
+    s = ca.MX.sym("s", formulation.size)
+    unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
+    return [np.asarray(unknowns(row)).ravel() for row in rows]
+
+
+def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:
+    """Refuse matrices that are those of a structure nowhere."""
+    names = formulation.declarations
+    for name in ("mass", "stiffness"):
+        if not any(_positive(getattr(formulation.matrices.numbers(x), name)) for x in points):
+            raise InputError(
+                f"{name} is not positive definite over the structure's degrees of freedom, neither at the guess nor at "
+                f"any of {len(points) - 1} points of the search space{names[name]}"
+            )
+    wrong: InputError | None = None
+    for x in points:
+        try:
+            formulation.matrices.structure(x, test)
+        except InputError as error:
+            wrong = wrong or error
+        else:
+            return
+    raise InputError(
+        f"the matrices (problem at {site}) are those of a structure nowhere, neither at the guess ({wrong}) nor at any "
+        f"of {len(points) - 1} points of the search space{names['damping']}"
+    )
+
+
+def _positive(matrix: Array) -> bool:
+    if not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) <= 0):
+        return False
+    size = np.sqrt(np.diag(matrix))
+    return bool(scipy.linalg.eigvalsh(matrix / np.outer(size, size), subset_by_index=(0, 0))[0] > 1e-13)
+
+
+def scale_of(formulation: Formulation, points: Array) -> Array:
+    """Variation of each constraint over the search space, (rows,)."""
+    values = np.array([formulation.constraints.at(x) for x in points])
+    with np.errstate(invalid="ignore"):
+        spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0, initial=0.0)
+    return np.where(spread > 0, spread, 1.0)
+
+
+def check_constraints(formulation: Formulation, points: Array, site: str) -> None:
+    """Refuse constraints that no point satisfies."""
+    constraints = formulation.constraints
+    if not constraints.lower.size:
+        return
+    scale = scale_of(formulation, points)
+    broken = np.array([constraints.violation(x) for x in points]) / scale
+    order = np.argsort(np.sum(np.where(np.isfinite(broken), broken, np.inf) ** 2, axis=1))
+    best, at = np.full(scale.size, np.inf), np.inf
+    for x in points[order[:8]]:  # those that break them least
+        left = _nearest(formulation, x, scale)
+        if left.max(initial=0.0) < at:
+            best, at = left, left.max(initial=0.0)
+        if at <= HELD:
+            return
+    worst = dict.fromkeys(source for source, miss in zip(constraints.sources, best, strict=True) if miss > HELD)
+    raise InputError(
+        f"no point within the bounds satisfies {' and '.join(worst)} (problem at {site}): widen the bounds of these "
+        "variables, or correct the relation"
+    )
+
+
+def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
+    """Least violation that IPOPT finds from a point, relative to the scale, (rows,)."""
+    constraints, lower, upper = formulation.constraints, formulation.lower, formulation.upper
+    width = np.where(upper > lower, upper - lower, 1.0)
+    t = ca.MX.sym("t", formulation.size)
+    slack = ca.MX.sym("slack", scale.size)
+    g = constraints.function(ca.DM(lower) + ca.DM(width) * t) / ca.DM(scale)
+    solver = ca.nlpsol(
+        "feasible", "ipopt", {"x": ca.vertcat(t, slack), "f": ca.sumsqr(slack), "g": g - slack}, quiet_options(200)
+    )
+    first = (start - lower) / width
+    answer = solver(
+        x0=np.concatenate([first, np.zeros(scale.size)]), lbg=constraints.lower / scale, ubg=constraints.upper / scale,
+        lbx=np.concatenate([np.zeros(first.size), np.full(scale.size, -np.inf)]),
+        ubx=np.concatenate([np.where(upper > lower, 1.0, 0.0), np.full(scale.size, np.inf)]),
+    )  # fmt: skip
+    # Whatever the status, what counts is the violation at the point that came, put inside the box.
+    found = np.clip(np.asarray(answer["x"]).ravel()[: first.size], 0.0, 1.0)
+    broken = constraints.violation(lower + width * found) / scale
+    return np.where(np.isfinite(broken), broken, np.inf)
+
 
 Monitor = Callable[[int, float], object]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.vector_fitting import Poles
-from sysid.models.geometry import Geometry
+from sysid.models.model import Geometry
 from sysid.models.unknowns import Unknown
 from sysid.problem import stored
 from sysid.problem.formulation import Formulation

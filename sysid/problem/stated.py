@@ -15,13 +15,12 @@ from sysid.errors import InputError, as_float, choice, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.damping import ModalDamping
-from sysid.models.geometry import Geometry
-from sysid.models.model import MatrixModel
+from sysid.models.model import Geometry, MatrixModel
 from sysid.models.stiffness import SpectralStiffness
 from sysid.models.unknowns import Variable, user_site
 from sysid.problem import stored
 from sysid.problem.formulation import Formulation
-from sysid.problem.given import MATRICES, as_models, geometry_of
+from sysid.problem.matrices import MATRICES, as_models, geometry_of
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Structure
 

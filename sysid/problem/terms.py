@@ -20,13 +20,21 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate, misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
-from sysid.models.geometry import Geometry
+from sysid.models.model import Geometry
 from sysid.models.unknowns import Expression, user_site, variable_of
 from sysid.problem.batch import TestObjective
-from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
-from sysid.problem.given import MATRICES, as_models, geometry_of
-from sysid.problem.matrices import Blocks, Matrices, blocks_of
-from sysid.problem.slopes import Rows, Slopes, rows_of_test, slopes_of, stacked_rows
+from sysid.problem.direct_response import (
+    Response,
+    Rows,
+    Slopes,
+    absolute_response,
+    relative_misfit,
+    relative_response,
+    rows_of_test,
+    slopes_of,
+    stacked_rows,
+)
+from sysid.problem.matrices import MATRICES, Blocks, Matrices, as_models, blocks_of, geometry_of
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import most_deviations
 
@@ -69,7 +77,7 @@ class TestTerm:
     """The records of a test, each weighed by its noise.
 
     The weight of a record's channel and line is the inverse of its stated standard deviation, as a product of one
-    factor a channel and one a line of each run (`sysid.measurement.noise`): a diagonal weight matrix a line.
+    factor a channel and one a line of each run (`sysid.measurement.whole`): a diagonal weight matrix a line.
 
     Attributes
     ----------

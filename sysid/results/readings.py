@@ -14,7 +14,7 @@ from sysid.assessment.uncertainty import Uncertainty
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.outliers import Outlier
-from sysid.problem.slopes import Slopes
+from sysid.problem.direct_response import Slopes
 from sysid.results.facts import Facts
 from sysid.structure.structure import Array, Structure
 

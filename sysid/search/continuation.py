@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError, Stop, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.feasibility import spread_points
-from sysid.problem.prepared import Prepared
+from sysid.problem.prepared import Prepared, spread_points
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import Coordinates, LocalResult

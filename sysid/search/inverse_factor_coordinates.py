@@ -21,10 +21,11 @@ import scipy
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
+from sysid.models.expressions import lower_triangle, triangle_entries
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
 from sysid.problem.prepared import Prepared
@@ -32,7 +33,6 @@ from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknown
 from sysid.search.modal_scaling import stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
-from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough

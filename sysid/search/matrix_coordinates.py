@@ -14,17 +14,16 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from sysid.models.expressions import lower_entries
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
-from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import Prepared
+from sysid.problem.prepared import HELD, LOOSE, Prepared
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.modal_coordinates import End, add_unknowns, frequencies
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
-from sysid.structure.triangular import lower_entries
 
 _JACOBIAN = 6e-7  # s of a processor, that the graph of a Jacobian takes for a row and the square of an unknown
 _SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how that grows with the modes

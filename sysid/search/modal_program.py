@@ -27,10 +27,10 @@ from sysid.modal_analysis.modal_estimate import (
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
+from sysid.models.expressions import lower_triangle, triangle_entries
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
-from sysid.structure.triangular import lower_triangle, triangle_entries
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]

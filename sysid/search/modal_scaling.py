@@ -11,10 +11,10 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from sysid.models.expressions import lower_entries
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import Ties
 from sysid.structure.structure import Array
-from sysid.structure.triangular import lower_entries
 
 _HELD = 1e5  # weight of known entries beside what is only likely
 _LEAST_SHARE = 1e-3  # of a total mass: the least that is left to the base, or to a mode beside the largest

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sysid.models.expressions import triangle
 from sysid.models.spectrum import spectrum_error
 from sysid.problem.prepared import Prepared
 from sysid.search.session import Session
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
-from sysid.structure.triangular import triangle
 
 RefineBy = Literal["closed-form", "ipopt", "leaders"]
 

@@ -17,7 +17,7 @@ from queue import SimpleQueue
 import casadi as ca
 import numpy as np
 
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
 from sysid.problem.batch import CHUNK, Batch, BatchModes, batch_modes, expanded

@@ -9,7 +9,7 @@ from sysid.assessment.determination import determine, intervals
 from sysid.assessment.sensitivity import directions_in_words, sensitivity
 from sysid.assessment.uncertainty import uncertainty
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
+from sysid.problem.direct_response import response_slopes, rows_of_test, slopes_of
 from sysid.search import local
 
 FREQ = np.linspace(1.0, 30.0, 40)

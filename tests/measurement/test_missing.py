@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement
-from sysid.measurement.missing import in_words
+from sysid.measurement.spectra import in_words
 from sysid.modal_analysis.residues import line_correlation
 
 LINES = 8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.measurement.noise import separable
+from sysid.measurement.whole import separable
 
 SHAPE = (2, 3, 7)
 

@@ -6,8 +6,8 @@ import pytest
 import scipy.integrate
 
 from sysid import FullMass
-from sysid.models.geometry import FACTOR_FLOOR
 from sysid.models.mass import gather_rows, sampling_exponent, spread_rows
+from sysid.models.model import FACTOR_FLOOR
 
 
 class TestSampling:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.models.registry import model_from_tree, model_to_tree
+from sysid.problem.stored import model_from_tree, model_to_tree
 
 with pytest.MonkeyPatch.context() as patch:
     patch.syspath_prepend(str(Path(__file__).parent))

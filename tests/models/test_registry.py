@@ -8,8 +8,8 @@ import pytest
 import sysid
 from sysid import catalogue
 from sysid.files.tree import check_tree, from_bytes, to_bytes
-from sysid.models.registry import model_from_tree, model_to_tree
 from sysid.problem import stored
+from sysid.problem.stored import model_from_tree, model_to_tree
 from sysid.results.identification import Recipe
 
 MODELS = (

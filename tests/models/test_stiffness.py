@@ -8,8 +8,7 @@ import scipy.linalg
 import sysid
 from sysid import ChainStiffness, InputError, SpectralStiffness
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.models.geometry import FACTOR_FLOOR, Geometry
-from sysid.models.model import MassBlocks, stiffness_blocks
+from sysid.models.model import FACTOR_FLOOR, Geometry, MassBlocks, stiffness_blocks
 from sysid.models.spectrum import Refinement
 from sysid.models.stiffness import WrittenStiffness
 

@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid.modal_analysis import modal_estimate
-from sysid.problem import formulation, given
+from sysid.problem import formulation, matrices
 from sysid.swarm import box
 
 SPRINGS = np.array([2e4, 1.5e4, 1e4])
@@ -69,7 +69,7 @@ def calls(monkeypatch):
 
     counted(modal_estimate, "find_poles")
     counted(formulation, "noise_level")
-    counted(given, "weighed_mass")
+    counted(matrices, "weighed_mass")
     counted(ca, "nlpsol")
     counted(box, "latin_hypercube")
     return ran

@@ -352,7 +352,7 @@ def test_a_symbol_of_the_other_kind_is_refused(nested):
 def test_two_variables_of_one_name_are_refused_with_both_places():
     k = sysid.Variable("twin", 3, lower=1e3, upper=1e5)
     m = sysid.Variable("twin", 3, lower=1, upper=9)
-    with pytest.raises(sysid.InputError, match="two variables are called 'twin'") as caught:
+    with pytest.raises(sysid.InputError, match="'twin'") as caught:
         sysid.Problem(TEST, mass=ca.diag(m), stiffness=chain(k), damping=[0.01] * 3)
     assert k.declared in str(caught.value)
     assert m.declared in str(caught.value)

@@ -9,7 +9,7 @@ import pytest
 
 import sysid
 from sysid.finding import Finding, Severity
-from sysid.problem.slopes import Rows
+from sysid.problem.direct_response import Rows
 
 MASSES, SPRINGS = np.array([2.0, 3.0]), np.array([700.0, 3000.0])
 TRUE = np.sqrt(SPRINGS / MASSES) / (2 * np.pi)  # Hz: two oscillators apart

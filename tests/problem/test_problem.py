@@ -9,9 +9,9 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
+from sysid.models.expressions import triangle, triangle_entries
 from sysid.models.spectrum import nearest_factors
 from sysid.problem import batch as candidates
-from sysid.structure.triangular import triangle, triangle_entries
 
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")

@@ -9,7 +9,7 @@ import pytest
 import sysid
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import Gains, ModalEstimate
-from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
+from sysid.problem.direct_response import response_slopes, rows_of_test, slopes_of
 
 FREQ = np.linspace(1.0, 14.0, 12)
 G = np.array([[1.0, 0.3], [1.0, 0.8], [0.9, -0.4]])

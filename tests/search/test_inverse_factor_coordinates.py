@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from sysid.models.expressions import triangle_entries
 from sysid.models.mass import total_of
 from sysid.nlp import NonlinearProgram
 from sysid.search import inverse_factor_coordinates as room
@@ -17,7 +18,6 @@ from sysid.search.inverse_factor_coordinates import (
     half_newton_decrement,
     skew_symmetric,
 )
-from sysid.structure.triangular import triangle_entries
 
 CASES = {
     "trace": {"mass": "trace"},

@@ -11,10 +11,10 @@ from sysid.measurement.measurement import unit_runs
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes, held_gauge, rank_one, separate_poles
 from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
+from sysid.models.expressions import lower_triangle, triangle_entries
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.search.modal_program import ModalResidual, _derivatives, hessian_of, solve_modes
-from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
 def modes_of(structure):

@@ -8,8 +8,7 @@ import scipy.optimize
 
 from sysid.errors import InputError
 from sysid.frame import Beam, Frame, PointMass, Section
-from sysid.measurement.rigid_body import rigid_body
-from sysid.structure.sensor import Sensor
+from sysid.structure.sensor import Sensor, rigid_body
 
 BETA_L = np.array([1.875104068711961, 4.694091132974175, 7.854757438237613])  # cos x cosh x = -1
 E, G, A, IY, IZ, J, RHO = 70e9, 26e9, 3e-4, 2e-9, 7e-9, 5e-9, 2700.0

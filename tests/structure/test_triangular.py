@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from sysid.structure.triangular import lower_entries, lower_triangle, triangle, triangle_entries
+from sysid.models.expressions import lower_entries, lower_triangle, triangle, triangle_entries
 
 WHOLE = np.array([[1.0, 20.0, 30.0], [2.0, 3.0, 40.0], [4.0, 5.0, 6.0]])
 

@@ -16,9 +16,9 @@ from sysid.finding import Finding, Severity, contradicting
 from sysid.modal_analysis.residues import Records
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
+from sysid.problem.direct_response import stacked_rows
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.problem.slopes import stacked_rows
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 

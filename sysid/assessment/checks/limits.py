@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Severity
-from sysid.measurement.missing import in_words
+from sysid.measurement.spectra import in_words
 
 
 def search_boxes(context: Context) -> Iterator[Finding]:

@@ -18,9 +18,8 @@ from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.modal_analysis.rough_poles import poles_of_test
-from sysid.problem.feasibility import points_of
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import Prepared
+from sysid.problem.prepared import Prepared, points_of
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, most_deviations
