@@ -14,8 +14,7 @@ from sysid.export.export import export
 from sysid.files.reading import read
 from sysid.identify import identify
 from sysid.measurement.in_time import TimeScores, time_scores
-from sysid.measurement.measurement import Measurement, Sensor
-from sysid.measurement.simulation import simulate
+from sysid.measurement.measurement import Measurement, Sensor, simulate
 from sysid.measurement.spectra import resample
 from sysid.measurement.whole import NoiseLevels
 from sysid.models.damping import ModalDamping, ProportionalDamping

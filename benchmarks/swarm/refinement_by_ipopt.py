@@ -11,7 +11,7 @@ import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm.noisy_tests import SEEDS, TOTALS, random_test
-from sysid.models.spectrum import Solver, SpectrumDistance
+from sysid.models.spectrum import SpectrumDistance, derivatives_of
 
 LEAST = 5  # leaders tried in a run
 STEP = 1e-30  # of complex steps; nothing is subtracted, so it may be that small
@@ -49,7 +49,7 @@ def derivative_errors(n: int, m: int, seed: int) -> tuple[float, float]:
 
     gradient = np.array([_objective(at(x + step), targets, start).imag for step in unit]) / STEP
     hessian = np.array([_slope(at(x + step), targets, start)[rows, columns].imag for step in unit]) / STEP
-    given = Solver(SpectrumDistance(n, targets), None).derivatives
+    given = derivatives_of(SpectrumDistance(n, targets))
     upper = np.asarray(given["hess_lag"](x, [], 1.0, []))
     full = upper + np.triu(upper, 1).T
     off = np.abs(np.asarray(given["grad_f"](x, [])[1]).ravel() - gradient).max() / np.abs(gradient).max()

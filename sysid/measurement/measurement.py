@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, as_float, choice, finite_array, refuse, sequence, whole_number
+from sysid.errors import (
+    InputError,
+    as_float,
+    choice,
+    flag,
+    instance,
+    numbers,
+    random_generator,
+    refuse,
+    sequence,
+    whole_number,
+)
 from sysid.measurement import spectra
 from sysid.measurement.spectra import Missing, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_cuts, check_options, levels_at_rest, per_run
 from sysid.structure.sensor import (
     BASE_AXES,
     Sensor,
-    axis_vector,
-    base_columns,
-    check_axes,
+    axes_of_base,
     checked_sensors,
     motion_of_sensors,
     sensors_from_tree,
@@ -79,7 +88,7 @@ class Measurement:
     sensors: tuple[Sensor, ...] | None = field(default=None, kw_only=True)
     response_std: Array | None = field(default=None, kw_only=True)
     force_std: Array | None = field(default=None, kw_only=True)
-    base_axes: tuple[str, ...] | None = field(default=None, kw_only=True)
+    base_axes: tuple[str, ...] = field(default=None, kw_only=True)  # type: ignore[arg-type] # filled below
     missing: InitVar[Missing] = field(default="refuse", kw_only=True)
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
@@ -101,7 +110,7 @@ class Measurement:
                 put(name, record)
         put("base", _records("base", self.base, self.freq.size))
         put("response", _records("response", self.response, self.freq.size))
-        put("rigid_body", _motion(self.rigid_body, self.sensors, self.base_axes, self.base.shape[1]))
+        put("rigid_body", motion_of_sensors(self.rigid_body, self.sensors, self.base_axes, self.base.shape[1]))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
         if self.force is not None:
             put("force", _records("force", self.force, self.freq.size))
@@ -122,41 +131,10 @@ class Measurement:
                 f"{len(self.sensors or ())} sensors are described but response has {sensors}",
             ),
         )
-        put("base_axes", self._check_base_axes(d))
-        check_axes(self.sensors or (), self.rigid_body, self.base_axes or ())
-        put("holes", (*self.holes, *named(holes, lines, self.sensor_names, 1)))
+        put("base_axes", axes_of_base(self.base_axes, self.sensors or (), self.rigid_body))
+        put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
-
-    def _check_base_axes(self, d: int) -> tuple[str, ...]:
-        if self.base_axes is not None:
-            names = tuple(BASE_AXES[column] for column in base_columns(self.base_axes))
-            if len(names) != d:
-                raise InputError(f"base_axes names {len(names)} directions but base has {d}")
-            return names
-        names = self._axes_of_sensors()
-        turns = not names and d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6)
-        refuse(
-            (d > 6, f"base has {d} directions; a rigid base has at most six"),
-            (
-                turns,
-                "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
-                "of at most 1): state base_axes, such as ['x', 'ry']",
-            ),
-        )
-        return names or BASE_AXES[:d]
-
-    def _axes_of_sensors(self) -> tuple[str, ...]:
-        """Names of the columns of G as translations along the sensors' axes; none where no or several names fit."""
-        if not self.sensors:
-            return ()
-        axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
-        columns = self.rigid_body.T
-        alike = np.array(
-            [[np.any(column) and np.allclose(axis, column, atol=1e-6) for axis in axes.T] for column in columns]
-        )
-        unique = np.all(alike.sum(axis=1) == 1) and np.all(alike.sum(axis=0) <= 1)
-        return tuple(BASE_AXES[i] for i in np.argmax(alike, axis=1)) if unique else ()
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -179,11 +157,10 @@ class Measurement:
     @property
     def translational(self) -> NDArray[np.bool_]:
         """Which base directions are translations, (d,)."""
-        assert self.base_axes is not None
         return np.array([name in BASE_AXES[:3] for name in self.base_axes])
 
     def __repr__(self) -> str:
-        axes = " ".join(self.base_axes or ())
+        axes = " ".join(self.base_axes)
         force = ", force" if self.force is not None else ""
         return f"<Measurement: {self.n_sensors} sensors, base {axes}, {self.n_runs} runs, {self.lines_in_words}{force}>"
 
@@ -349,37 +326,20 @@ class Measurement:
         """
         lines = check_frequencies(freq)
         choice("missing", missing, ("refuse", "drop"))
-        given: dict[str, Any] = {
-            "freq": lines,
-            "frf": frf,
-            "force": force,
-            "response_std": response_std,
-            "force_std": force_std,
-        }
-        holes: dict[str, NDArray[np.bool_]] = {}
-        every = lines
-        if missing == "drop":
-            given, holes = present(given)
-        dropped, lines = lines.size - given["freq"].size, given["freq"]
-        force, response_std, force_std = (given[name] for name in ("force", "response_std", "force_std"))
-        H = complete("frf", given["frf"], complex)
-        if H.ndim == 2:  # (n_sensors, n_freq)
-            H = np.expand_dims(H, 1)
-        H = _records("frf", H, lines.size)
+        read = numbers if missing == "drop" else complete  # lines with NaN go where the records have all runs
+        H = read("frf", frf, complex)
+        H = _records("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
         d = H.shape[1]
-        F = None if force is None else _records("force", force, lines.size)
-        wanted = (d, d, lines.size)
-        if F is not None and F.shape != wanted:
-            raise InputError(f"force is {F.shape}; with {d} base directions it is {wanted}")
+        F = None if force is None else _records("force", force, lines.size, read)
+        if F is not None and F.shape != (d, d, lines.size):
+            raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}")
+        given = H, F, _std("response_std", response_std, H, read), _std("force_std", force_std, F, read)
         # The base direction comes first: it becomes the run.
-        by_run: Any = lambda record: None if record is None else np.moveaxis(record, 1, 0)  # noqa: E731
-        options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "dropped": dropped}
-        test = cls(
-            lines, unit_runs(d, lines.size), by_run(H), force=by_run(F),
-            response_std=by_run(_std("response_std", response_std, H)),
-            force_std=by_run(_std("force_std", force_std, F)), **options,
+        by_run: Any = [None if record is None else np.moveaxis(record, 1, 0) for record in given]
+        return cls(
+            lines, unit_runs(d, lines.size), by_run[0], rigid_body=rigid_body, force=by_run[1], sensors=sensors,
+            response_std=by_run[2], force_std=by_run[3], base_axes=base_axes, missing=missing,
         )  # fmt: skip
-        return replace(test, holes=named(holes, every, test.sensor_names, 0)) if holes else test
 
     @classmethod
     def from_time(
@@ -437,7 +397,7 @@ class Measurement:
         """
         choice("estimator", estimator, ("records", "spectra", "h1", "h2"))
         check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
-        G = _motion(rigid_body, sensors, base_axes, spectra.directions(runs))
+        G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator in ("records", "spectra"):
@@ -466,23 +426,13 @@ class Measurement:
     noise_from_rest = staticmethod(levels_at_rest)
 
 
-def _motion(given: ArrayLike | None, sensors: Any, base_axes: Any, d: int) -> Array:
-    """Motion of the sensors with the base, as given or told by the sensors' descriptions."""
-    if given is not None:
-        return np.atleast_2d(finite_array("rigid_body", given))
-    described = checked_sensors(sensors)
-    if described is None:
-        raise InputError("rigid_body is missing: give it (sysid.rigid_body), or sensors=[sysid.Sensor(...), ...]")
-    return motion_of_sensors(described, base_axes, d)
-
-
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
     """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
 
 
-def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
-    array = complete(name, value, complex)
+def _records(name: str, value: Any, n_freq: int, read: Callable[..., Any] = complete) -> ComplexArray:
+    array: ComplexArray = read(name, value, complex)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[-1] != n_freq:
@@ -490,12 +440,12 @@ def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
     return array
 
 
-def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Array | None:
+def _std(name: str, value: Any, record: ComplexArray | None, read: Callable[..., Any] = complete) -> Array | None:
     if value is None:
         return None
-    array = complete(name, value)
     if record is None:
         raise InputError(f"{name} is given without its record")
+    array = read(name, value)
     try:
         full = np.broadcast_to(array, record.shape).copy()
     except ValueError:
@@ -503,3 +453,57 @@ def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Arr
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
     return full
+
+
+def simulate(
+    structure: Structure,
+    freq: ArrayLike,
+    *,
+    noise: float = 0.0,
+    force: bool = False,
+    rng: int | np.random.Generator | None = None,
+    base_axes: str | Sequence[str] | None = None,
+) -> Measurement:
+    """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
+
+    Parameters
+    ----------
+    structure : Structure
+    freq : array_like, shape (n_freq,)
+        Hz.
+    noise : float
+        Circular complex noise with ``E|e|² = noise² mean|record|²``, the mean taken over all runs,
+        channels and lines; responses and force apart.
+    force : bool
+        Record the base force too.
+    rng : int, numpy Generator or None
+    base_axes : str or sequence of str, optional
+        Names of the base directions, as in `Measurement`.
+
+    Returns
+    -------
+    Measurement
+        Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
+        ``measurement.residual(structure)``.
+    """
+    instance("structure", structure, Structure)
+    noise = as_float("noise", noise, "a finite fraction >= 0", at_least=0)
+    lines = check_frequencies(freq)
+    random = random_generator(rng)
+    response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
+    base_force = force_std = None
+    if flag("force", force):
+        base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
+    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
+    return Measurement(
+        lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
+        force=base_force, response_std=response_std, force_std=force_std, **options,
+    )  # fmt: skip
+
+
+def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
+    if noise == 0:
+        return record, None
+    std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
+    error = random.standard_normal(record.shape) + 1j * random.standard_normal(record.shape)
+    return record + error * std / np.sqrt(2), np.array(std)

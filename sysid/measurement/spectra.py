@@ -320,17 +320,14 @@ def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np
     return given | kept, {name: np.isnan(arrays[name]) for name, hole in holes.items() if np.any(hole)}
 
 
-def named(
-    holes: dict[str, NDArray[np.bool_]], freq: Array, sensors: Sequence[str], axis: int
-) -> tuple[tuple[str, Array], ...]:
-    """Records with NaN, and where, Hz: sensors by name, their `axis` being that of three; others by their own."""
+def named(holes: dict[str, NDArray[np.bool_]], freq: Array, sensors: Sequence[str]) -> tuple[tuple[str, Array], ...]:
+    """Records with NaN, and where, Hz: sensors by name, other records by their own."""
     found: list[tuple[str, Array]] = []
     for name, hole in holes.items():
-        rows, names = hole.reshape(1, -1, hole.shape[-1]), [name]
-        if name in ("response", "frf"):
-            first = np.moveaxis(hole, axis if hole.ndim == 3 else 0, 0)
-            rows, names = first.reshape(len(first), -1, freq.size), list(sensors)
-        found += [(one, freq[np.any(row, axis=0)]) for one, row in zip(names, rows, strict=True) if np.any(row)]
+        names, channels = (sensors, len(sensors)) if name == "response" else ([name], 1)
+        # Of a sensor all runs, of another record all its channels.
+        rows = hole.reshape(-1, channels, hole.shape[-1]).any(axis=0)
+        found += [(one, freq[row]) for one, row in zip(names, rows, strict=True) if np.any(row)]
     return tuple(found)
 
 

@@ -218,23 +218,23 @@ def check_cuts(runs: Sequence[TimeRun], at_rest: Sequence[bool], rigid_body: Arr
     InputError
         Names the run and what was done to it.
     """
-    for i, (run, rest) in enumerate(zip(runs, at_rest, strict=True)):
-        if rest:
-            continue
-        where = of_run(i, len(runs))
+    for i in np.flatnonzero(~np.array(at_rest)).tolist():
+        run, where = runs[i], of_run(i, len(runs))
         still = padded(run, rigid_body)
-        if still:
-            raise InputError(
+        refuse(
+            (
+                still,
                 f"the last {still} samples{where} hold one value in every channel while the structure was in motion "
                 "just before: a record that was padded with zeros, or that stopped early; leave them out: whole "
-                "records may have any length"
-            )
-        if tapered(run, rigid_body):
-            raise InputError(
+                "records may have any length",
+            ),
+            (
+                tapered(run, rigid_body),
                 f"all channels{where}, the base's too, fall to zero together towards both ends, faster than a "
                 "structure comes to rest: a window or a fade was laid over the record; give it as it was recorded: "
-                "whole records may begin and end in motion (or state at_rest=True where it was at rest at both ends)"
-            )
+                "whole records may begin and end in motion (or state at_rest=True where it was at rest at both ends)",
+            ),
+        )
 
 
 def padded(run: TimeRun, rigid_body: Array) -> int:
@@ -333,17 +333,16 @@ def levels_at_rest(
 
 def _levels(runs: Sequence[TimeRun], sample_rate: float, low: float, high: float) -> Array:
     """Deviations of a sample of responses, base and force, (channels,), by the lines from `low` to `high` Hz."""
-    power, lines = np.zeros(0), 0
+    power, lines = np.zeros(1), 0
     for run in runs:
-        records = np.vstack([run.response, run.base, *([] if run.force is None else [run.force])])
+        records = np.vstack([one for one in (run.response, run.base, run.force) if one is not None])
         n = records.shape[1]
         freq = np.fft.rfftfreq(n, 1 / sample_rate)
         keep = (np.arange(freq.size) > 1) & (freq < sample_rate / 2) & (freq >= low) & (freq <= high)
         unit = np.vander(np.linspace(-1.0, 1.0, n), 2)
         slopes = np.linalg.lstsq(unit, records.T, rcond=None)[0]
         spectra = np.fft.rfft(records - (unit @ slopes).T, axis=1)[:, keep]
-        run_power = np.sum(np.abs(spectra) ** 2, axis=1) / n
-        power, lines = (run_power if not power.size else power + run_power), lines + int(keep.sum())
+        power, lines = power + np.sum(np.abs(spectra) ** 2, axis=1) / n, lines + int(keep.sum())
     if lines < _FEWEST_LINES:
         raise InputError(
             f"the stretch at rest has {lines} lines in the band, too few for a level (at least {_FEWEST_LINES}): "

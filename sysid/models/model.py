@@ -78,10 +78,9 @@ class Geometry:
         recovery: Array | None = None,
         weighed: Array | Callable[[], Array] | None = None,
     ) -> None:
-        self.modal, test = modal, modal.records
-        self.rigid_body = test.rigid_body if rigid_body is None else rigid_body
+        self.modal, self.translational = modal, modal.records.translational
+        self.rigid_body = modal.records.rigid_body if rigid_body is None else rigid_body
         self.recovery = np.eye(len(self.rigid_body)) if recovery is None else recovery
-        self.translational = test.translational
         self._weighed = weighed
         self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
 
@@ -120,8 +119,7 @@ class Geometry:
     @property
     def found(self) -> dict[str, Any] | None:
         """The poles where they were found already, for storing; None where they were not."""
-        poles: Poles | None = self.__dict__.get("poles")
-        return None if poles is None else asdict(poles)
+        return asdict(self.poles) if "poles" in vars(self) else None
 
     @found.setter
     def found(self, tree: dict[str, Any] | None) -> None:
@@ -204,35 +202,33 @@ class Geometry:
 
     def totals(self, total_mass: ArrayLike | None) -> Array:
         """Total mass in each base direction, (d,): kg, or kg m² where the direction is a rotation."""
-        if total_mass is None:
-            return self._unstated_totals if self.weighed is None else self.weighed
+        if total_mass is None and self.weighed is not None:
+            return self.weighed
+        if total_mass is None:  # unit mass; a rotation carries it at the radius of gyration of the sensors
+            lever = np.where(self.translational, 1.0, np.sqrt(np.mean(self.rigid_body**2, axis=0)))
+            return np.where(lever > 0, lever**2, 1.0)
         check_total_mass(total_mass)
         given = np.array(total_mass, dtype=float)
         whole = self.rigid_total(given)
         if whole is not None:
             return np.diag(whole)
-        if given.ndim == 0 and not np.all(self.translational):
-            raise InputError(
-                f"total_mass = {given:g} kg is one number but the base also rotates; "
-                f"give {self.d} numbers, kg for translations and kg m² for rotations"
-            )
-        if given.shape not in ((), (self.d,)):
-            raise InputError(
-                f"total_mass has shape {given.shape}; one number, ({self.d},) or ({self.d}, {self.d}) is needed"
-            )
+        refuse(
+            (
+                given.ndim == 0 and not np.all(self.translational),
+                f"total_mass = {given} kg is one number but the base also rotates; give {self.d} numbers, kg for "
+                "translations and kg m² for rotations",
+            ),
+            (
+                given.shape not in ((), (self.d,)),
+                f"total_mass has shape {given.shape}; one number, ({self.d},) or ({self.d}, {self.d}) is needed",
+            ),
+        )
         return np.full(self.d, given)
-
-    @property
-    def _unstated_totals(self) -> Array:
-        """Unit mass, (d,); a rotation carries it at the radius of gyration of the sensors."""
-        lever = np.where(self.translational, 1.0, np.sqrt(np.mean(self.rigid_body**2, axis=0)))
-        return np.where(lever > 0, lever**2, 1.0)
 
     def rigid_total(self, total_mass: ArrayLike | None) -> Array | None:
         """The rigid-body mass (d, d) where all of it is stated, else None."""
         if total_mass is None or np.ndim(total_mass) < 2:
             return None
-        check_total_mass(total_mass)
         given = np.array(total_mass, dtype=float)
         if given.shape != (self.d, self.d):
             raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")

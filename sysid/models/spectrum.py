@@ -88,8 +88,8 @@ def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Re
     n, scale = factor.shape[0], targets[-1]
     distance = SpectrumDistance(n, targets / scale)
     rows, columns = np.tril_indices(n)
-    solver, start = Solver(distance, max_time), triangle_entries(factor) / scale
-    x, status = solver.minimum(start, np.where(rows == columns, NEGLIGIBLE, -np.inf))
+    lower = np.where(rows == columns, NEGLIGIBLE, -np.inf)
+    x, status = minimum(distance, triangle_entries(factor) / scale, lower, max_time)
     refined = triangle(x, n) * scale
     answer = Refinement(refined, spectrum_error(refined, targets), status in SOLVED, status)
     return answer if answer.error < EXACT else replace(answer, success=False, status=f"{status}, spectrum missed")
@@ -162,35 +162,34 @@ def _check(factors: Array, targets: Array) -> None:
         raise InputError(f"{targets.size} target frequencies for a model with {factors.shape[-1]}")
 
 
-class Solver:
-    """IPOPT on a distance, with the distance's own derivatives."""
+def derivatives_of(distance: SpectrumDistance) -> dict[str, _InNumbers]:
+    """A distance, its gradient and its Hessian as IPOPT asks for them; to be kept for as long as it runs."""
+    size = distance.rows.size
+    x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
+    below = np.tril_indices(size)  # by rows, as CasADi stores the upper triangle of a symmetric matrix by columns
+    return {
+        "f": _InNumbers(lambda at: [distance.value(at)], [x], [one]),
+        "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
+        "hess_lag": _InNumbers(
+            lambda at, _, weight, __: [float(weight) * distance.hessian(at)[below]],
+            [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
+        ),
+    }  # fmt: skip
 
-    def __init__(self, distance: SpectrumDistance, max_time: float | None) -> None:
-        size = distance.rows.size
-        x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
-        value = _InNumbers(lambda at: [distance.value(at)], [x], [one])
-        below = np.tril_indices(size)  # by rows, as CasADi stores the upper triangle of a symmetric matrix by columns
-        # Kept, as CasADi does not: without them the solver would call what is gone.
-        self.derivatives = {
-            "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
-            "hess_lag": _InNumbers(
-                lambda at, _, weight, __: [float(weight) * distance.hessian(at)[below]],
-                [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
-            ),
-        }  # fmt: skip
-        self._value, z = value, ca.MX.sym("x", size)
-        limits = {} if max_time is None else {"max_wall_time": max_time}
-        # Relative squares need no scaling of IPOPT's; a slope of 1e-9 leaves errors below that.
-        options = quiet_options(300, tol=1e-9, nlp_scaling_method="none", **limits)
-        self._solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": value(z)}, {**options, **self.derivatives})
 
-    def minimum(self, start: Array, lower: Array) -> tuple[Array, str]:
-        """Where it ends, and IPOPT's status."""
-        end = np.asarray(self._solve(x0=start, lbx=lower)["x"]).ravel()
-        for one in (self._value, *self.derivatives.values()):
-            if one.interrupt is not None:
-                raise one.interrupt
-        return end, str(self._solve.stats()["return_status"])
+def minimum(distance: SpectrumDistance, start: Array, lower: Array, max_time: float | None) -> tuple[Array, str]:
+    """Where IPOPT ends from the entries `start` of L_H, and its status."""
+    functions, z = derivatives_of(distance), ca.MX.sym("x", start.size)
+    limits = {} if max_time is None else {"max_wall_time": max_time}
+    # Relative squares need no scaling of IPOPT's; a slope of 1e-9 leaves errors below that.
+    options = quiet_options(300, tol=1e-9, nlp_scaling_method="none", **limits)
+    own = {name: functions[name] for name in ("grad_f", "hess_lag")}
+    solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": functions["f"](z)}, {**options, **own})
+    end = np.asarray(solve(x0=start, lbx=lower)["x"]).ravel()
+    for function in functions.values():
+        if function.interrupt is not None:
+            raise function.interrupt
+    return end, str(solve.stats()["return_status"])
 
 
 class _InNumbers(ca.Callback):

@@ -62,12 +62,11 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
         )
     found: list[Any] = []
     for name, value in zip(MATRICES, (mass, stiffness, damping), strict=True):
-        if _is_model(value, len(found)):
-            found.append(value)
-        elif is_expression(value):
-            found.append(_WRITTEN[name](value))
-        else:
-            found.append((_WRITTEN | {"mass": KnownMass})[name](_numbers(name, value)))
+        if is_expression(value):
+            value = _WRITTEN[name](value)
+        elif not _is_model(value, len(found)):
+            value = (_WRITTEN | {"mass": KnownMass})[name](_numbers(name, value))
+        found.append(value)
     return found[0], found[1], found[2]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -134,7 +134,48 @@ def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
 Monitor = Callable[[int, float], object]
 
 
-class Prepared:
+class SearchSpace:
+    """Search space and objective of a problem: what is read off its `formulation`."""
+
+    @property
+    def formulation(self) -> Formulation:
+        """Matrices, terms and constraints as CasADi functions of the unknowns."""
+        raise NotImplementedError
+
+    @property
+    def variables(self) -> tuple[Unknown, ...]:
+        """All that is searched."""
+        return self.formulation.unknowns
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds, (n_variables,)."""
+        return self.formulation.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds, (n_variables,)."""
+        return self.formulation.upper
+
+    @property
+    def n_variables(self) -> int:
+        """Number of scalar unknowns (the paper's D)."""
+        return self.formulation.size
+
+    def values(self, structure: Structure) -> Array:
+        """Unknowns that stand for `structure`, (n_variables,); inverse of `structure` where the models can hold it."""
+        return self.formulation.values(structure)
+
+    def residual(self, x: Array) -> float:
+        """``‖predicted - measured‖ / ‖measured‖`` over all fitted tests: see `Formulation.residual`."""
+        return self.formulation.residual(x)
+
+    def objective(self, x: Array) -> float:
+        """Objective at `x`: see `Formulation.objective`."""
+        return self.formulation.objective(x)
+
+
+class Prepared(SearchSpace):
     """Statements of a user, and the modal estimate of each fitted test: what strategies search and checks judge.
 
     Parameters
@@ -343,30 +384,10 @@ class Prepared:
         return scale * np.where(formulation.constraints.equal, LOOSE, HELD)
 
     @property
-    def variables(self) -> tuple[Unknown, ...]:
-        """All that is searched."""
-        return self.formulation.unknowns
-
-    @property
     def poles(self) -> Poles | None:
         """Poles found in the data, where the stiffness is free and states no frequencies."""
         stated = self.formulation.stiffness
         return self.geometry.poles if stated.spectrum is not None and not self.stated.states_frequencies else None
-
-    @property
-    def lower(self) -> Array:
-        """Lower bounds, (n_variables,)."""
-        return self.formulation.lower
-
-    @property
-    def upper(self) -> Array:
-        """Upper bounds, (n_variables,)."""
-        return self.formulation.upper
-
-    @property
-    def n_variables(self) -> int:
-        """Number of scalar unknowns (the paper's D)."""
-        return self.formulation.size
 
     @property
     def unknowns(self) -> tuple[tuple[str, int], ...]:
@@ -432,18 +453,6 @@ class Prepared:
             raise InputError(f"x has shape {values.shape}; this problem has ({self.n_variables},) unknowns")
         return self.formulation.matrices.structure(values, self.measurement)
 
-    def values(self, structure: Structure) -> Array:
-        """Unknowns that stand for `structure`, (n_variables,); inverse of `structure` where the models can hold it."""
-        return self.formulation.values(structure)
-
-    def residual(self, x: Array) -> float:
-        """``‖predicted - measured‖ / ‖measured‖`` over all fitted tests: see `Formulation.residual`."""
-        return self.formulation.residual(x)
-
-    def objective(self, x: Array) -> float:
-        """Objective at `x`: see `Formulation.objective`."""
-        return self.formulation.objective(x)
-
     def keeps_constraints(self, x: Array) -> bool:
         """True where constraints hold, to round-off beside what they make over the search space."""
         constraints = self.formulation.constraints
@@ -458,6 +467,6 @@ class Prepared:
     def to_tree(self) -> dict[str, Any]:
         """That of the stated problem, with the poles that were found where the same records show them again."""
         given = all(one.records is one.given for one in self.screened.modal)
-        poles: Poles | None = vars(self.geometry).get("poles") if given else None
+        poles = self.geometry.found if given else None
         fits = [None if one.record_fit is None else one.record_fit.to_tree() for one in self.modal]
-        return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles), "fits": fits}
+        return {**self.stated.to_tree(), "poles": poles, "fits": fits}

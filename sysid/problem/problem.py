@@ -11,16 +11,15 @@ from numpy.typing import ArrayLike
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
-from sysid.models.unknowns import Unknown
 from sysid.problem import stored
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import Prepared
+from sysid.problem.prepared import Prepared, SearchSpace
 from sysid.problem.stated import StatedProblem
 from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Problem(StatedProblem):
+class Problem(StatedProblem, SearchSpace):
     """A problem of identification: a measurement, and what is stated of the structure.
 
     The constructor checks types, shapes and what is written. Attributes that need the modes of the records find them
@@ -129,29 +128,9 @@ class Problem(StatedProblem):
         return self.prepared.tolerance
 
     @property
-    def variables(self) -> tuple[Unknown, ...]:
-        """All that is searched."""
-        return self.formulation.unknowns
-
-    @property
     def poles(self) -> Poles | None:
         """Poles found in the data, where the stiffness is free and states no frequencies."""
         return self.prepared.poles
-
-    @property
-    def lower(self) -> Array:
-        """Lower bounds, (n_variables,)."""
-        return self.formulation.lower
-
-    @property
-    def upper(self) -> Array:
-        """Upper bounds, (n_variables,)."""
-        return self.formulation.upper
-
-    @property
-    def n_variables(self) -> int:
-        """Number of scalar unknowns (the paper's D)."""
-        return self.formulation.size
 
     @property
     def unknowns(self) -> tuple[tuple[str, int], ...]:
@@ -170,15 +149,3 @@ class Problem(StatedProblem):
     def structure(self, x: ArrayLike) -> Structure:
         """The structure that the unknowns `x`, (n_variables,) in the variables' own units, stand for."""
         return self.prepared.structure(x)
-
-    def values(self, structure: Structure) -> Array:
-        """Unknowns that stand for `structure`, (n_variables,); inverse of `structure` where the models can hold it."""
-        return self.formulation.values(structure)
-
-    def residual(self, x: Array) -> float:
-        """``‖predicted - measured‖ / ‖measured‖`` over all fitted tests: see `Formulation.residual`."""
-        return self.formulation.residual(x)
-
-    def objective(self, x: Array) -> float:
-        """Objective at `x`: see `Formulation.objective`."""
-        return self.formulation.objective(x)

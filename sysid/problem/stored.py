@@ -211,11 +211,12 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         Where the expressions are damaged.
     """
     if tree["without"] is not None:
-        raise NotRebuiltError(
-            f"it was stored without the expressions of its problem, as {_printable(tree['without'])} cannot be stored"
-        )
+        what = "".join(filter(str.isprintable, tree["without"]))  # nothing that moves a terminal's cursor
+        raise NotRebuiltError(f"it was stored without the expressions of its problem, as {what} cannot be stored")
     variables = {part["name"]: _variable_from_tree(part) for part in tree["variables"]}
-    outputs = _outputs_from_tree(tree, list(variables.values()))
+    symbols = [variable.symbol for variable in variables.values()]
+    made = [] if tree["expressions"] is None else decode(tree["expressions"], symbols)
+    outputs: dict[int | None, ca.MX | None] = {None: None, **dict(enumerate(made))}
     return {
         **_matrices_from_tree(tree, outputs),
         "residuals": [_residual_from_tree(part, outputs) for part in tree["residuals"]],
@@ -223,11 +224,6 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         "misfit": outputs[tree["misfit"]],
         "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
     }
-
-
-def _printable(text: str) -> str:
-    """A text of a file without what would move a terminal's cursor."""
-    return "".join(letter for letter in text if letter.isprintable())
 
 
 def needs_module(tree: Tree) -> bool:
@@ -291,21 +287,10 @@ def _encoded(variables: Sequence[Variable], expressions: Sequence[ca.MX]) -> Tre
     return encode([variable.symbol for variable in variables], expressions, points)
 
 
-def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> dict[int | None, ca.MX | None]:
-    """The expressions by their numbers; None by None."""
-    if tree["expressions"] is None:
-        return {None: None}
-    return {None: None, **dict(enumerate(decode(tree["expressions"], [variable.symbol for variable in variables])))}
-
-
 def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
     """Mass, stiffness, damping and what takes their degrees of freedom to the sensors."""
-    arrays = {name: given[name] for name in _ARRAYS if given.get(name) is not None}
-    return {
-        **{name: _matrix_to_tree(name, given[name], outputs) for name in MATRICES},
-        **dict.fromkeys(_ARRAYS),
-        **{name: np.array(value, dtype=float) for name, value in arrays.items()},
-    }
+    matrices = {name: _matrix_to_tree(name, given[name], outputs) for name in MATRICES}
+    return matrices | {name: plain(given.get(name)) for name in _ARRAYS}
 
 
 def _matrices_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Tree:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, instance, sequence, shown, text
+from sysid.errors import InputError, finite_array, instance, refuse, sequence, shown, text
 
 Array = NDArray[np.floating[Any]]
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -194,7 +194,65 @@ def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
     return row[:3]
 
 
-def check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence[str]) -> None:
+def motion_of_sensors(given: ArrayLike | None, sensors: Any, base_axes: Any, d: int) -> Array:
+    """Motion of sensors with a base that moves in d directions, (n_sensors, d): as given, or as they are described.
+
+    Where directions are not named, three are x y z, and one is that of the sensors, all along one axis.
+    """
+    if given is not None:
+        return np.atleast_2d(finite_array("rigid_body", given))
+    described = checked_sensors(sensors)
+    if described is None:
+        raise InputError("rigid_body is missing: give it (sysid.rigid_body), or sensors=[sysid.Sensor(...), ...]")
+    if base_axes is None:
+        along = {sensor.axis.lstrip("+-") if isinstance(sensor.axis, str) else "" for sensor in described}
+        base_axes = {1: "".join(along) if len(along) == 1 else "", 3: "xyz"}.get(d)
+        if not base_axes:
+            raise InputError(
+                f"the sensors do not tell along which {d} of x y z rx ry rz the base moves: state base_axes, such as "
+                "['x'], or rigid_body"
+            )
+    return rigid_body(sensors=described, base_axes=base_axes)
+
+
+def axes_of_base(given: Any, sensors: Sequence[Sensor], rigid_body: Array) -> tuple[str, ...]:
+    """Names of the columns of `rigid_body` (n_sensors, d): as given, told by the sensors' axes, or x y z.
+
+    Refused where sensors' axes are not what their rows say.
+    """
+    d = rigid_body.shape[1]
+    if given is None:
+        names = _axes_of_sensors(sensors, rigid_body)
+    else:
+        names = tuple(BASE_AXES[column] for column in base_columns(given))
+    turns = not names and d <= 3 and np.any(np.linalg.norm(rigid_body, axis=1) > 1 + 1e-6)
+    refuse(
+        (given is not None and len(names) != d, f"base_axes names {len(names)} directions but base has {d}"),
+        (d > 6, f"base has {d} directions; a rigid base has at most six"),
+        (
+            turns,
+            "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
+            "of at most 1): state base_axes, such as ['x', 'ry']",
+        ),
+    )
+    names = names or BASE_AXES[:d]
+    _check_axes(sensors, rigid_body, names)
+    return names
+
+
+def _axes_of_sensors(sensors: Sequence[Sensor], rigid_body: Array) -> tuple[str, ...]:
+    """Names of the columns of G as translations along the sensors' axes; none where no or several names fit."""
+    if not sensors:
+        return ()
+    axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in sensors])
+    alike = np.array(
+        [[np.any(column) and np.allclose(axis, column, atol=1e-6) for axis in axes.T] for column in rigid_body.T]
+    )
+    unique = np.all(alike.sum(axis=1) == 1) and np.all(alike.sum(axis=0) <= 1)
+    return tuple(BASE_AXES[i] for i in np.argmax(alike, axis=1)) if unique else ()
+
+
+def _check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence[str]) -> None:
     """Refuse sensors whose axes are not what their rows of `rigid_body` (n_sensors, d) say.
 
     For unit translation of the base a sensor has its axis's part in that direction, wherever it is. A base that moves
@@ -216,20 +274,3 @@ def check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence
             f"{rows[i, j]:.3g} for unit {names[j]} of the base, in place of {wanted[i, j]:.3g}: correct axis, row or "
             "base_axes"
         )
-
-
-def motion_of_sensors(sensors: Sequence[Sensor], base_axes: str | Sequence[str] | None, d: int) -> Array:
-    """Motion of described sensors with a base that moves in d directions; these are told where they are in doubt.
-
-    Three directions are x y z, one that of the sensors, all along one axis.
-    """
-    if base_axes is None:
-        along = {sensor.axis.lstrip("+-") for sensor in sensors if isinstance(sensor.axis, str)}
-        whole = len(along) == 1 and all(isinstance(sensor.axis, str) for sensor in sensors)
-        if d != 3 and not (d == 1 and whole):
-            raise InputError(
-                f"the sensors do not tell along which {d} of x y z rx ry rz the base moves: state base_axes, such as "
-                "['x'], or rigid_body"
-            )
-        base_axes = "xyz" if d == 3 else along.pop()
-    return rigid_body(sensors=sensors, base_axes=base_axes)
