@@ -35,11 +35,8 @@ class RunInTime(NamedTuple):
 def runs_in_time(test: Measurement) -> list[RunInTime]:
     """The records of each run; none where the spectra are not those of whole records.
 
-    Parameters
-    ----------
-    test : Measurement
-        As ``from_time`` gives it with the estimators "records" and "spectra". Spectra that were given as such are
-        taken for those of whole records where their lines can be, and all runs have the same.
+    Spectra that were given as such are taken for those of whole records where their lines can be, and all runs have the
+    same.
     """
     whole = as_whole(test).whole
     if whole is None:

@@ -30,14 +30,9 @@ class TimeRun(NamedTuple):
 class Estimate:
     """Averaged frequency response functions.
 
-    Attributes
-    ----------
-    freq : (n_freq,) Hz
-    frf, frf_std : (n_sensors, d, n_freq)
-        Absolute transmissibility and its standard deviation, ``sqrt(E|e|²)``.
-    force, force_std : (d, d, n_freq) or None
-    coherence : (n_sensors, n_freq)
-        Multiple coherence of each sensor with all base directions.
+    Lines `freq` (n_freq,), Hz; absolute transmissibility `frf` and its standard deviation ``sqrt(E|e|²)``, (n_sensors,
+    d, n_freq); `force` likewise (d, d, n_freq), or None; multiple coherence of each sensor with all base directions,
+    (n_sensors, n_freq).
     """
 
     freq: Array
@@ -88,13 +83,10 @@ def directions(runs: Any) -> int:
 def whole_record(
     runs: Sequence[TimeRun], sample_rate: float
 ) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray | None]:
-    """Fourier transforms of whole records, without the zero line; m/s² s.
+    """Lines (n_freq,), and Fourier transforms of whole records (runs, channels, n_freq), without the zero line; m/s² s.
 
-    Where runs differ in length the lines are those of all, and a run has zeros at the lines of others.
-
-    Returns
-    -------
-    freq (n_freq,), base (runs, d, n_freq), response (runs, n_sensors, n_freq), force or None
+    Of base, responses and force, None where there is none. Where runs differ in length the lines are those of all, and
+    a run has zeros at the lines of others.
     """
     lengths = sorted({run.base.shape[1] for run in runs})
     grids = {n: np.arange(1, n // 2 + 1) / n for n in lengths}  # in cycles a sample
@@ -296,12 +288,7 @@ Missing = Literal["refuse", "drop"]
 def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np.bool_]]]:
     """Records and deviations, by name, without the lines at which any of them is NaN; and where they are.
 
-    Infinite numbers stay.
-
-    Raises
-    ------
-    InputError
-        Where no line is left.
+    Infinite numbers stay. Refused where no line is left.
     """
     lines, found = given["freq"].size, {name: value for name, value in given.items() if value is not None}
     arrays = {name: numbers(name, value, float if "std" in name else complex) for name, value in found.items()}

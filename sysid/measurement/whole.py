@@ -53,12 +53,8 @@ class NoiseLevels:
     def of(self, runs: int, n_sensors: int, d: int, force: bool) -> NoiseLevels:
         """The levels of a test of so many runs and channels: one number for all of a kind will do.
 
-        Those given as a row a run stay so, (runs, channels); others are (channels,).
-
-        Raises
-        ------
-        InputError
-            Where there are levels of another number of channels, or none of a force that was measured.
+        Those given as a row a run stay so, (runs, channels); others are (channels,). Refused where there are levels of
+        another number of channels, or none of a force that was measured.
         """
         refuse(
             (
@@ -204,19 +200,7 @@ def check_cuts(runs: Sequence[TimeRun], at_rest: Sequence[bool], rigid_body: Arr
 
     A taper on every channel is no base motion that the structure answered: its transients are not those of modes.
     What cannot be told is let pass: a quiet stretch before an event, padding in front, windows that do not fall to
-    zero, fades shorter than some periods of the motion.
-
-    Parameters
-    ----------
-    runs : sequence of Run
-    at_rest : sequence of bool
-        Of each run.
-    rigid_body : (n_sensors, d)
-
-    Raises
-    ------
-    InputError
-        Names the run and what was done to it.
+    zero, fades shorter than some periods of the motion. `rigid_body` is (n_sensors, d).
     """
     for i in np.flatnonzero(~np.array(at_rest)).tolist():
         run, where = runs[i], of_run(i, len(runs))
@@ -354,15 +338,10 @@ def _levels(runs: Sequence[TimeRun], sample_rate: float, low: float, high: float
 def separable(std: Array | None, shape: tuple[int, int, int]) -> tuple[Array, Array]:
     """Weights 1/std as a product: of the channels (channels,) and of the lines of each run (runs, n_freq).
 
-    They are geometric means over the other axes: exact where the noise is a product of the two, as it is where
-    one number, one number for each channel or one spectrum is stated. Fits with other weights than 1/std are
-    unbiased all the same, and their covariance is computed with the stated noise.
-
-    Parameters
-    ----------
-    std : (runs, channels, n_freq) or None
-        Ones are returned where nothing is stated.
-    shape : (runs, channels, n_freq)
+    They are geometric means over the other axes of `std`, (runs, channels, n_freq): exact where the noise is a product
+    of the two, as it is where one number, one number for each channel or one spectrum is stated, and ones where nothing
+    is. Fits with other weights than 1/std are unbiased all the same, and their covariance is computed with the stated
+    noise.
     """
     runs, channels, lines = shape
     floored = raised(std)

@@ -325,10 +325,7 @@ class WrittenMass(Written):
 def _deviations(name: str, std: ArrayLike | None, of: str, values: ArrayLike | None) -> Array | None:
     """Standard deviations in the shape of the values; None where all are exact.
 
-    Raises
-    ------
-    InputError
-        Where they are negative, not finite beside a value, of another shape, or there are no values.
+    Refused where they are negative, not finite beside a value, of another shape, or there are no values.
     """
     if std is None:
         return None

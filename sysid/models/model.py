@@ -253,13 +253,7 @@ class FieldTree:
 
 
 def plain(value: Any) -> Any:
-    """A number, an array of numbers, a text or None as a tree holds it.
-
-    Raises
-    ------
-    TypeError, ValueError
-        Where it is none of these.
-    """
+    """A number, an array of numbers, a text or None as a tree holds it; TypeError or ValueError where it is none."""
     if value is None or isinstance(value, str):
         return value
     numbers = np.asarray(value, dtype=float)
@@ -454,13 +448,7 @@ class Written:
 
 
 def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
-    """All blocks of a mass, where its model gives the matrix alone.
-
-    Raises
-    ------
-    InputError
-        Where a block has another shape, here and below.
-    """
+    """All blocks of a mass, where its model gives the matrix alone; refused where one has another shape."""
     n, d = geometry.n, geometry.d
     if isinstance(given, MassBlocks):
         for part, shape in zip(given[:3], ((n, n), (n, d), (d, d)), strict=True):

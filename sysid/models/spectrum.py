@@ -24,17 +24,10 @@ SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses t
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A factor refined by IPOPT.
+    """A factor refined by IPOPT: lower-triangular L_H (n, n), rad/s.
 
-    Attributes
-    ----------
-    factor : (n, n)
-        Lower-triangular L_H, rad/s.
-    error : float
-        Largest relative difference of the replaced eigenvalues from their targets.
-    success : bool
-    status : str
-        IPOPT's own, and whether it missed the spectrum.
+    `error` is the largest relative difference of the replaced eigenvalues from their targets; `status` is IPOPT's own,
+    and whether it missed the spectrum.
     """
 
     factor: Array
@@ -58,17 +51,8 @@ def replace_spectrum(lam: Array, targets: Array) -> Array:
 def nearest_factors(factors: Array, targets: Array) -> Array:
     """The closed form: of each ``L_H L_H'`` the nearest matrix (Frobenius) with the target spectrum.
 
-    Parameters
-    ----------
-    factors : (k, n, n)
-        Lower-triangular L_H, rad/s.
-    targets : (m,), m <= n
-        Measured circular frequencies, rad/s.
-
-    Returns
-    -------
-    (k, n, n)
-        Refined factors, with positive diagonals.
+    Lower-triangular L_H (k, n, n) and circular frequencies (m,), m <= n, both rad/s, to refined factors with positive
+    diagonals.
     """
     _check(factors, targets)
     lam, psi = np.linalg.eigh(factors @ factors.swapaxes(1, 2))

@@ -29,16 +29,9 @@ _IN_STEP = 128  # candidates that go in step: with more, the virtual machine's m
 class Batch:
     """A CasADi function of one candidate over many candidates, without conversions.
 
-    A function in scalar operations is replayed for a chunk of candidates in step (`elementwise`), another is called
-    for one after the other. What a candidate gives does not depend on the others, to the last bit. An instance
-    is for one thread at a time; ``copy`` makes one for another thread.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Of the arrays of one candidate, dense.
-    threads : int
-        CasADi's own, where candidates are taken one by one; 0 for none.
+    A function in scalar operations is replayed for a chunk of candidates in step (`elementwise`), another is called for
+    one after the other, by so many `threads` of CasADi's own, 0 for none. What a candidate gives does not depend on the
+    others, to the last bit. An instance is for one thread at a time; ``copy`` makes one for another thread.
     """
 
     def __init__(self, function: ca.Function, threads: int = 0) -> None:
@@ -99,19 +92,9 @@ class Batch:
 def elementwise(function: ca.Function, count: int) -> ca.Function:
     """A function in scalar operations (SX) as one of `count` candidates, each of its operations done for all at once.
 
-    CasADi's virtual machine then spends its time on numbers, not on reading instructions.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Of one candidate; inputs and outputs of any shape.
-    count : int
-
-    Returns
-    -------
-    casadi.Function
-        Of columns (count,), one an entry of an input, one input after the other; to the same of the outputs. Columns of
-        their own because the virtual machine then reads and writes each where it is needed, and holds fewer.
+    CasADi's virtual machine then spends its time on numbers, not on reading instructions. Inputs are columns (count,),
+    one an entry of an input, one input after the other; outputs likewise. Columns of their own because the virtual
+    machine then reads and writes each where it is needed, and holds fewer.
     """
     inputs = [[ca.MX.sym("i", count) for _ in range(function.nnz_in(i))] for i in range(function.n_in())]
     outputs = [[ca.MX()] * function.nnz_out(i) for i in range(function.n_out())]
@@ -163,14 +146,8 @@ def expanded(function: ca.Function) -> ca.Function:
 class BatchModes(NamedTuple):
     """Mass-normalised modes of many candidates, those of a candidate in ascending order of frequency.
 
-    Attributes
-    ----------
-    shapes : (count, n, n)
-        One mode a row.
-    loads : (count, n, d)
-        Participations.
-    rigid_body_mass : (count, d, d)
-        ``[G; I]' M [G; I]``.
+    Shapes (count, n, n), one mode a row; participations (count, n, d); rigid-body mass ``[G; I]' M [G; I]`` (count, d,
+    d).
     """
 
     shapes: Array
@@ -189,9 +166,7 @@ def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Arr
     H : (count, n, n)
         ``L^-1 K_SS L^-T``, the lower triangle at least; overwritten where it is not finite.
     right : (count, n, n + d)
-        ``[L^-1, L^-1 B]``.
-    rigid : (count, d, d)
-        Rigid-body mass.
+        ``[L^-1, L^-1 B]``; `rigid` is the rigid-body mass, (count, d, d).
     *base : (count, n, d), (count, d, d)
         ``L^-1 M_S0`` and M_00, where the whole mass may be indefinite.
     """
@@ -291,14 +266,7 @@ class TestObjective:
     """Squared relative residual of one test: (count, size) to (count,), as `TestTerm.rows` has it.
 
     Responses follow from LAPACK's batched eigensolvers: of the undamped structure where damping is by ratios, else of
-    the state space.
-
-    Parameters
-    ----------
-    test : Measurement
-    matrices : Matrices
-    shift : float, 1/s
-        Of the complex frequencies from the imaginary axis.
+    the state space. `shift`, 1/s, is that of the complex frequencies from the imaginary axis.
     """
 
     __test__ = False  # pytest takes names in Test for its own

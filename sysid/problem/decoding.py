@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from math import prod
 from typing import Any
 
 import casadi as ca
@@ -21,13 +23,7 @@ Tree = dict[str, Any]
 
 
 def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
-    """Give the expressions of a tree that `sysid.problem.encoding.encode` made, in some symbols.
-
-    Parameters
-    ----------
-    tree : dict
-    symbols : sequence of MX
-        With the patterns of those that the expressions were written in.
+    """Give the expressions of a tree that `sysid.problem.encoding.encode` made, in symbols of the patterns of its own.
 
     Raises
     ------
@@ -54,12 +50,7 @@ def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
 
 
 def limited(what: str, value: float, most: float) -> None:
-    """Refuse what is larger than its limit.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse what is larger than its limit."""
     if not value <= most:
         raise InputError(f"its expressions ask for too much: {what} is {value:.3g}, at most {most:.3g} is read")
 
@@ -208,29 +199,21 @@ class _Matrices:
         limited("the work of one evaluation", self.work, operations.LIMITS.work)
 
     def _evaluated(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
-        if name in operations.WITHOUT_PARAMETERS:
-            _exactly(0, parameters)
         if name in operations.ENTRYWISE:  # of which no result is larger than the largest argument
+            _exactly(0, parameters)
             return [_entrywise(ca.MX, name, arguments)]
         self._check_size(name, arguments, parameters)
-        if name in operations.PLAIN:
-            count, plain = operations.PLAIN[name]
-            return [plain(*_exactly(count, arguments))]
-        if name in operations.JOINING:
-            return [operations.JOINING[name](*arguments)]
+        if name in operations.MATRICES:
+            count, of_parameters, make = operations.MATRICES[name]
+            made = make(*_exactly(count, arguments), *_exactly(of_parameters, parameters))
+            return made if isinstance(made, list) else [made]
         if name in operations.RESHAPING:
             return [operations.RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
-        if name in operations.SPLITTING:
-            (whole,) = _exactly(1, arguments)
-            return operations.split_matrix(name, whole, parameters)
-        if name in operations.REPEATING:
-            return [operations.REPEATING[name](*_exactly(1, arguments), 1, *_exactly(1, parameters))]
-        if name.partition(" ")[0] == "solve":
-            b, a = _exactly(2, arguments)
-            return [operations.linear_solve(name[6:], b, a, transposed=bool(*_exactly(1, parameters)))]
+        solver = name.partition(" ")[2]
         others = {
             "const": self._const, "getnonzeros": self._getnonzeros, "setnonzeros": self._setnonzeros,
             "addnonzeros": self._addnonzeros, "einstein": self._einstein, "call": self._call,
+            f"solve {solver}".strip(): partial(self._solve, solver),
         }  # fmt: skip
         if name not in others:
             raise ValueError("no operation that this sysid knows")
@@ -238,26 +221,22 @@ class _Matrices:
 
     def _check_size(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> None:
         """Refuse what would be too large, or take too long, before it is made."""
-        rows, columns = [one.size1() for one in arguments], [one.size2() for one in arguments]
-        entries: float = 0
-        work: float = max((one.nnz() for one in arguments), default=0)
-        if name in operations.JOINING:
-            down, across = sum(rows), sum(columns)
-            tall, wide = max(rows, default=0), max(columns, default=0)
-            entries = {"vertcat": down * wide, "horzcat": tall * across, "diagcat": down * across}[name]
-        elif name == "kron":
-            entries = float(np.prod([one.numel() for one in arguments], dtype=float))
-        elif name == "horzrepmat":
-            entries = max((one.numel() for one in arguments), default=0) * max(parameters, default=0)
-        elif name == "mtimes":
-            work = min(arguments[1].nnz() * columns[2], rows[1] * arguments[2].nnz())
-        elif name == "determinant":
-            work = max(rows) ** 3
-        elif name.startswith("solve"):
-            n = max(rows)
-            entries, work = n**2, n**2 * (n + max(columns[0], 1))
+        kind, rows, columns = name.partition(" ")[0], *([one.size(axis) for one in arguments] for axis in (1, 2))
+        sizes, nonzeros = [one.numel() for one in arguments], [one.nnz() for one in arguments]
+        n, wide = max(rows, default=0), max(columns, default=0)
+        entries = {
+            "vertcat": sum(rows) * wide, "horzcat": n * sum(columns), "diagcat": sum(rows) * sum(columns),
+            "kron": prod(sizes[:2]), "horzrepmat": max(sizes, default=0) * max(parameters, default=0), "solve": n**2,
+        }.get(kind, 0)  # fmt: skip
+        work = {"determinant": n**3, "solve": n**2 * (n + max([1, *columns[:1]]))}.get(kind, max(nonzeros, default=0))
+        if kind == "mtimes":
+            work = min(nonzeros[1] * columns[2], rows[1] * nonzeros[2])
         limited("the size of a matrix", entries, operations.LIMITS.entries)
         self._add_work(work)
+
+    def _solve(self, solver: str, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
+        b, a = _exactly(2, arguments)
+        return [operations.linear_solve(solver, b, a, transposed=bool(*_exactly(1, parameters)))]
 
     def _const(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         pattern, one = self._reader.pattern(parameters[0]), bool(parameters[1])
@@ -362,8 +341,9 @@ def _places(parameters: Sequence[int]) -> list[int]:
     return [first + step * i for i in range(count)]
 
 
-def _exactly(count: int, values: Sequence[Any]) -> Sequence[Any]:
-    if len(values) != count:
+def _exactly(count: int | None, values: Sequence[Any]) -> Sequence[Any]:
+    """Values, refused where they are not so many; None is any number."""
+    if len(values) != count and count is not None:
         raise ValueError(f"{len(values)} of {count} arguments or parameters")
     return values
 

@@ -39,13 +39,7 @@ class NotStorableError(InputError):
 def encode(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX], points: Sequence[Sequence[Array]]) -> Tree:
     """Give expressions of some symbols as plain data, which was read again and compared.
 
-    Parameters
-    ----------
-    symbols : sequence of MX
-        Of which the expressions are made; no others.
-    expressions : sequence of MX
-    points : sequence of sequence of array_like
-        Values of all symbols; at each the values and the Jacobian of what is read again are the same to the bit.
+    At each of the `points`, values of all symbols, values and Jacobian of what is read again are the same to the bit.
 
     Raises
     ------

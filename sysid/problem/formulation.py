@@ -97,19 +97,10 @@ class Parts(NamedTuple):
 
 
 class Formulation:
-    """Unknowns and objective of a search; each part is made when it is first asked for.
+    """Unknowns and objective of a search, of what a `Problem` states; each part is made when it is first asked for.
 
-    Parameters
-    ----------
-    modal : sequence of ModalEstimate
-        Of the problem's own test, and of further ones among the residuals.
-    models : tuple of MatrixModel
-        Of mass, stiffness and damping.
-    geometry : Geometry
-    residuals, constraints : sequence
-    misfit : expression, optional
-    healing : mapping of Variable to expression
-        As in `Problem`.
+    `modal` are the modal estimates of the problem's own test and of further ones among the residuals, `models` those of
+    mass, stiffness and damping.
     """
 
     def __init__(
@@ -137,13 +128,7 @@ class Formulation:
         self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
 
     def check(self) -> None:
-        """Refuse what is declared wrong.
-
-        Raises
-        ------
-        InputError
-            Where a matrix, residual or constraint is not what it must be; it names the variables in it.
-        """
+        """Refuse what is declared wrong: a matrix, residual or constraint; the message names the variables in it."""
         _check_names([*(unknown for group in self.of_models for unknown in group), *self.variables])
         _check_healing(self.healed, self.unknowns)
         known = self.mass.weighs or self.mass.rigid_total is not None
@@ -417,10 +402,7 @@ class Formulation:
     def values(self, structure: Structure) -> Array:
         """Unknowns that stand for a structure; variables that enter no matrix at their guess.
 
-        Raises
-        ------
-        InputError
-            Where a matrix is written in expressions, or a model has no inverse.
+        Refused where a matrix is written in expressions, or a model has no inverse.
         """
         found = [model.values(self.geometry, structure) for model in self.models]
         return np.concatenate([*found, self.guess[self.parts.damping.stop :]])

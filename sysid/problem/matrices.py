@@ -43,13 +43,7 @@ _WANTED = {
 
 
 def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, MatrixModel, MatrixModel]:
-    """Models as they are, numbers and expressions as models.
-
-    Raises
-    ------
-    InputError
-        Where something is none of these.
-    """
+    """Models as they are, numbers and expressions as models; refused where something is none of these."""
     if (
         isinstance(damping, tuple)
         and len(damping) == 2
@@ -109,10 +103,7 @@ def geometry_of(
 ) -> Geometry:
     """Geometry of the degrees of freedom of a problem or of a further test, of which the modal estimate is.
 
-    Raises
-    ------
-    InputError
-        Where recovery, rigid_body_dofs and the sensors do not fit together.
+    Refused where recovery, rigid_body_dofs and the sensors do not fit together.
     """
     test = modal.records
     for name, given in (("recovery", recovery), ("rigid_body_dofs", rigid_body_dofs)):
@@ -160,12 +151,8 @@ def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other:
 def rough_mass(test: Measurement, geometry: Geometry, stated: Array | None) -> Array:
     """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search.
 
-    Beside modes of `stated` circular frequencies, rad/s; where there are none, of the poles in the data.
-
-    Raises
-    ------
-    InputError
-        Where the force weighs a negative mass, with lines far below the first mode.
+    Beside modes of `stated` circular frequencies, rad/s; where there are none, of the poles in the data. Refused where
+    the force weighs a negative mass, with lines far below the first mode.
     """
     assert test.force is not None
     if stated is None:
@@ -305,13 +292,7 @@ class Matrices:
         return factor, self.inverse(factor)
 
     def structure(self, x: Array, test: Measurement) -> Structure:
-        """The structure that `x` stands for, with the sensors of a test.
-
-        Raises
-        ------
-        InputError
-            Where it stands for none.
-        """
+        """The structure that `x` stands for, with the sensors of a test; refused where it stands for none."""
         M, M_S0, M_00, K, C, H = self.numbers(x)
         G, ratios = self.rigid_body, None
         if self.by_ratios:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -64,29 +65,14 @@ def _vector(text: bytes, name: bytes, form: str) -> list[float]:
 
 @dataclass(frozen=True)
 class FileLimits:
-    """The most that a file can ask for: many times what a problem of some hundred degrees of freedom takes.
-
-    Attributes
-    ----------
-    operations : int
-    axes : int
-        Of the grid of an interpolant.
-    entries : int
-        Of one matrix, zeros too: 80 MB.
-    stored : int
-        Of all patterns of matrices together.
-    work : int
-        Multiplications in one evaluation: some seconds.
-    memory : int
-        Numbers that one evaluation keeps at a time: 400 MB.
-    """
+    """The most that a file can ask for: many times what a problem of some hundred degrees of freedom takes."""
 
     operations: int = 3_000_000
-    axes: int = 10
-    entries: int = 10_000_000
-    stored: int = 30_000_000
-    work: int = 3_000_000_000
-    memory: int = 50_000_000
+    axes: int = 10  # of the grid of an interpolant
+    entries: int = 10_000_000  # of one matrix, zeros too: 80 MB
+    stored: int = 30_000_000  # nonzeros of all patterns of matrices together
+    work: int = 3_000_000_000  # multiplications in one evaluation: some seconds
+    memory: int = 50_000_000  # numbers that one evaluation keeps at a time: 400 MB
 
 
 LIMITS = FileLimits()
@@ -104,37 +90,54 @@ BINARY = (
 SOLVERS = ("qr", "ldl", "lapackqr", "lapacklu", "csparse", "csparsecholesky", "lsqr", "tridiag", "mumps")
 INTERPOLANTS = {"linear": "LinearInterpolant", "bspline": "BSplineInterpolant"}  # CasADi's classes of them
 
-# Number of arguments, and what makes it of them; without further parameters.
-PLAIN: dict[str, tuple[int, Callable[..., ca.MX]]] = {
-    "transpose": (1, lambda x: x.T),
-    "mtimes": (3, lambda z, x, y: ca.mac(x, y, z)),  # z + x y
-    "dot": (2, ca.dot),
-    "bilin": (3, ca.bilin),
-    "rank1": (4, ca.rank1),
-    "kron": (2, ca.kron),
-    "norm1": (1, ca.norm_1),
-    "norm2": (1, ca.norm_2),
-    "normf": (1, ca.norm_fro),
-    "norminf": (1, ca.norm_inf),
-    "determinant": (1, ca.det),
-    "mmin": (1, ca.mmin),
-    "mmax": (1, ca.mmax),
-    "logsumexp": (1, ca.logsumexp),
-    "find": (1, ca.find),
-    "low": (2, ca.low),
-}
-JOINING: dict[str, Callable[..., ca.MX]] = {"vertcat": ca.vertcat, "horzcat": ca.horzcat, "diagcat": ca.diagcat}
+ENTRYWISE = dict.fromkeys(UNARY, 1) | dict.fromkeys(BINARY, 2)  # number of arguments
+JOINING = ("vertcat", "horzcat", "diagcat")
 RESHAPING: dict[str, Callable[..., ca.MX]] = {
     "reshape": ca.reshape, "project": ca.project, "sparsity_cast": ca.sparsity_cast,
 }  # fmt: skip
-SPLITTING = ("vertsplit", "horzsplit", "diagsplit")
-REPEATING: dict[str, Callable[..., ca.MX]] = {"horzrepmat": ca.repmat, "horzrepsum": ca.repsum}
 
-ENTRYWISE = dict.fromkeys(UNARY, 1) | dict.fromkeys(BINARY, 2)  # number of arguments
-WITHOUT_PARAMETERS = frozenset({*ENTRYWISE, *PLAIN, *JOINING})
+
+def split_matrix(name: str, x: ca.MX, *offsets: int) -> list[ca.MX]:
+    """Pieces of a matrix between offsets of its rows, its columns, or both (in turn: of rows, of columns)."""
+    # The function of CasADi's, and of each of its lists of offsets where it ends.
+    split, ends = {
+        "vertsplit": (ca.vertsplit, x.shape[:1]), "horzsplit": (ca.horzsplit, x.shape[1:]),
+        "diagsplit": (ca.diagsplit, x.shape),
+    }[name]  # fmt: skip
+    lists = [list(offsets[i :: len(ends)]) for i in range(len(ends))]
+    for rising, end in zip(lists, ends, strict=True):
+        if len(rising) < 2 or rising[0] != 0 or rising[-1] != end or any(b < a for a, b in pairwise(rising)):
+            raise ValueError("offsets do not rise from the first row or column to the last")
+    return list(split(x, *lists))
+
+
+# Numbers of arguments and of parameters, None for any, and what makes a matrix, or several, of both.
+MATRICES: dict[str, tuple[int | None, int | None, Callable[..., ca.MX | list[ca.MX]]]] = {
+    "transpose": (1, 0, lambda x: x.T),
+    "mtimes": (3, 0, lambda z, x, y: ca.mac(x, y, z)),  # z + x y
+    "dot": (2, 0, ca.dot),
+    "bilin": (3, 0, ca.bilin),
+    "rank1": (4, 0, ca.rank1),
+    "kron": (2, 0, ca.kron),
+    "norm1": (1, 0, ca.norm_1),
+    "norm2": (1, 0, ca.norm_2),
+    "normf": (1, 0, ca.norm_fro),
+    "norminf": (1, 0, ca.norm_inf),
+    "determinant": (1, 0, ca.det),
+    "mmin": (1, 0, ca.mmin),
+    "mmax": (1, 0, ca.mmax),
+    "logsumexp": (1, 0, ca.logsumexp),
+    "find": (1, 0, ca.find),
+    "low": (2, 0, ca.low),
+    **{name: (None, 0, getattr(ca, name)) for name in JOINING},
+    **{name: (1, None, partial(split_matrix, name)) for name in ("vertsplit", "horzsplit", "diagsplit")},
+    "horzrepmat": (1, 1, lambda x, count: ca.repmat(x, 1, count)),
+    "horzrepsum": (1, 1, lambda x, count: ca.repsum(x, 1, count)),
+}
+WITHOUT_PARAMETERS = frozenset({*ENTRYWISE, *(name for name, (_, count, _) in MATRICES.items() if count == 0)})
 NAMES = (
-    *WITHOUT_PARAMETERS, *RESHAPING, *SPLITTING, *REPEATING, "const", "getnonzeros", "setnonzeros", "addnonzeros",
-    "einstein", "solve", "call",
+    *ENTRYWISE, *MATRICES, *RESHAPING, "const", "getnonzeros", "setnonzeros", "addnonzeros", "einstein", "solve",
+    "call",
 )  # fmt: skip
 
 
@@ -188,22 +191,6 @@ def set_nonzeros(y: ca.MX, x: ca.MX, places: Sequence[int], *, add: bool) -> ca.
 def _check_places(places: Sequence[int], count: int) -> None:
     if len(places) and not (min(places) >= -1 and max(places) < count):
         raise ValueError(f"a place is not among {count} entries")
-
-
-def split_matrix(name: str, x: ca.MX, offsets: Sequence[int]) -> list[ca.MX]:
-    """Pieces of a matrix between offsets of its rows, its columns, or both (in turn: of rows, of columns)."""
-    if name == "diagsplit":
-        rows, columns = list(offsets[::2]), list(offsets[1::2])
-        _check_offsets(rows, x.size1())
-        _check_offsets(columns, x.size2())
-        return list(ca.diagsplit(x, rows, columns))
-    _check_offsets(offsets, x.size1() if name == "vertsplit" else x.size2())
-    return list((ca.vertsplit if name == "vertsplit" else ca.horzsplit)(x, list(offsets)))
-
-
-def _check_offsets(offsets: Sequence[int], size: int) -> None:
-    if len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != size or any(b < a for a, b in pairwise(offsets)):
-        raise ValueError("offsets do not rise from the first row or column to the last")
 
 
 def einstein(c: ca.MX, a: ca.MX, b: ca.MX, tensors: Sequence[Sequence[int]]) -> ca.MX:

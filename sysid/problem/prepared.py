@@ -186,8 +186,7 @@ class Prepared(SearchSpace):
     in_squares : bool
         Whether squares are fitted, whatever loss is stated.
     fits : sequence of RecordFit or None, optional
-        Of whole records, of each test, of which its modal estimate is made when first asked for; None where it has
-        none.
+        Of whole records, of each test, of which its modal estimate is made when first asked for.
     """
 
     def __init__(
@@ -202,10 +201,8 @@ class Prepared(SearchSpace):
     def prepare(self, monitor: Monitor | None = None) -> None:
         """Find what the records tell beside the modes before any search: noise, poles, weights where they are needed.
 
-        Parameters
-        ----------
-        monitor : callable, optional
-            Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
+        `monitor` is called with (iteration, relative residual) while poles are looked for; what it raises passes
+        through.
         """
         try:
             self.screened = self._screened(monitor)
@@ -359,11 +356,7 @@ class Prepared(SearchSpace):
     def check(self) -> None:
         """Refuse what cannot be searched, before any search.
 
-        Raises
-        ------
-        InputError
-            Where no point of the search space makes a structure, no point keeps the constraints, or a model cannot be
-            stored.
+        Where no point of the search space makes a structure, none keeps the constraints, or a model cannot be stored.
         """
         formulation, site = self.formulation, self.stated.site
         if not formulation.variables and formulation.free_modes:

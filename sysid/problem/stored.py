@@ -53,13 +53,7 @@ def _has(kind: type, methods: tuple[str, ...]) -> bool:
 
 
 def model_to_tree(model: Any) -> dict[str, Any]:
-    """Tree of a matrix model: what `to_tree` of its class gives, else its attributes.
-
-    Raises
-    ------
-    InputError
-        Where the class could not be found again, or an attribute is no number, array of numbers, text or None.
-    """
+    """Tree of a matrix model: what `to_tree` of its class gives, else its attributes; refused where there is none."""
     kind = type(model)
     if "<locals>" in kind.__qualname__:
         raise InputError(
@@ -88,12 +82,8 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
     """Give the model of a tree that `model_to_tree` made; nothing is imported for it.
 
     A class of the user's own has to be there already: in a module that this process has imported, or in a problem
-    module that was named to it (see `sysid.catalogue.build`), or beside that one.
-
-    Raises
-    ------
-    InputError
-        Where the class is not to be found; says which one, and in which module.
+    module that was named to it (see `sysid.catalogue.build`), or beside that one. Else it is refused by name and
+    module.
     """
     module, colon, name = str(tree["kind"]).rpartition(":")
     if not colon and name not in _PACKAGE_KINDS:
@@ -112,13 +102,7 @@ def _public_name(module: str) -> str:
 
 
 def _found(module: str, name: str) -> Any:
-    """The class `name` of a module that is imported.
-
-    Raises
-    ------
-    InputError
-        Where there is none, or there are several from different files.
-    """
+    """The class `name` of a module that is imported; refused where there is none, or several from different files."""
     found = [(one, kind) for one in _imported(module) if (kind := _class_in(one, name)) is not None]
     if not found:
         raise InputError(
@@ -165,24 +149,10 @@ class NotRebuiltError(InputError):
 
 
 def to_tree(given: Mapping[str, Any]) -> Tree:
-    """Tree of the models, numbers and expressions that a `Problem` was given.
+    """Tree of the models, numbers and expressions that a `Problem` was given, by the names of its parameters.
 
-    Parameters
-    ----------
-    given : mapping
-        By the names of the parameters of `Problem`; mass, stiffness and damping are needed, and only what stands
-        beside measurement, reference, validation and goal is stored.
-
-    Returns
-    -------
-    dict
-        Without the expressions where one of them holds what cannot be stored, such as a Python callback; "without"
-        then says which, and is None elsewhere.
-
-    Raises
-    ------
-    InputError
-        Where a model cannot be stored.
+    Without the expressions where one of them holds what cannot be stored, such as a Python callback; "without" then
+    says which, and is None elsewhere. An `InputError` where a model cannot be stored.
     """
     outputs = _Outputs()
     tree = {
@@ -206,9 +176,8 @@ def from_tree(tree: Tree) -> dict[str, Any]:
     Raises
     ------
     NotRebuiltError
-        Where a class of the user's own is missing, or the expressions were not stored.
-    InputError
-        Where the expressions are damaged.
+        Where a class of the user's own is missing, or the expressions were not stored; InputError where they are
+        damaged.
     """
     if tree["without"] is not None:
         what = "".join(filter(str.isprintable, tree["without"]))  # nothing that moves a terminal's cursor

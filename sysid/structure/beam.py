@@ -46,21 +46,10 @@ _MASS = {
 
 
 def stiffness_patterns(length: float) -> Array:
-    """Stiffness of a beam for unit EA, EIy, EIz and GJ.
+    """Stiffness of a beam of this length, m, for unit EA, EIy, EIz and GJ, in local axes, (4, 12, 12).
 
-    Parameters
-    ----------
-    length : float
-        m.
-
-    Returns
-    -------
-    ndarray, shape (4, 12, 12)
-        In local axes; the element's stiffness is their sum weighted with EA, EIy, EIz, GJ.
-
-    References
-    ----------
-    Przemieniecki, Theory of Matrix Structural Analysis (1968), section 5.6, without shear.
+    The element's stiffness is their sum weighted with EA, EIy, EIz, GJ (Przemieniecki, Theory of Matrix Structural
+    Analysis (1968), section 5.6, without shear).
     """
     rod, bending = _ROD / length, _BENDING * _turns(length) / length**3
     parts = [(_AXIAL, rod), (_BENDING_XZ, _FLIP * bending), (_BENDING_XY, bending), (_TORSION, rod)]
@@ -68,25 +57,12 @@ def stiffness_patterns(length: float) -> Array:
 
 
 def mass_patterns(length: float, kind: str) -> Array:
-    """Mass of a beam for unit mass per length and unit polar inertia per length.
+    """Mass of a beam for unit mass per length and unit polar inertia per length, in local axes, (2, 12, 12).
 
-    Parameters
-    ----------
-    length : float
-        m.
-    kind : {"consistent", "lumped"}
-        "consistent": cubic deflections, linear stretch and twist. "lumped": half the mass at each
-        node; the rotary terms in bending are those of Hinton, Rock and Zienkiewicz (1976), the
-        consistent diagonal scaled to the right mass: (mass) L² / 78 a node.
-
-    Returns
-    -------
-    ndarray, shape (2, 12, 12)
-        In local axes; the element's mass is their sum weighted with rho A and rho (Iy + Iz).
-
-    References
-    ----------
-    Przemieniecki (1968), section 11.4, without the rotary inertia of the cross-section in bending.
+    The element's mass is their sum weighted with rho A and rho (Iy + Iz). "consistent": cubic deflections, linear
+    stretch and twist (Przemieniecki (1968), section 11.4, without the rotary inertia of the cross-section in bending).
+    "lumped": half the mass at each node; the rotary terms in bending are those of Hinton, Rock and Zienkiewicz (1976),
+    the consistent diagonal scaled to the right mass: (mass) L² / 78 a node.
     """
     rod, bending = (length * matrix for matrix in _MASS[kind])
     bending = bending * _turns(length)
