@@ -17,10 +17,9 @@ from sysid.measurement.in_time import TimeScores, time_scores
 from sysid.measurement.measurement import Measurement, Sensor, simulate
 from sysid.measurement.spectra import resample
 from sysid.measurement.whole import NoiseLevels
-from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks, Totals
-from sysid.models.stiffness import ChainStiffness, SpectralStiffness
+from sysid.models.stiffness_and_damping import ChainStiffness, ModalDamping, ProportionalDamping, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior

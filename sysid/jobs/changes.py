@@ -12,7 +12,7 @@ from sysid.errors import InputError, as_float, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
-from sysid.models.stiffness import SpectralStiffness
+from sysid.models.stiffness_and_damping import SpectralStiffness
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification

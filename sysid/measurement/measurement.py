@@ -23,7 +23,7 @@ from sysid.errors import (
 )
 from sysid.measurement import spectra
 from sysid.measurement.spectra import Missing, complete, named, present
-from sysid.measurement.whole import NoiseLevels, WholeRecords, check_cuts, check_options, levels_at_rest, per_run
+from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
     Sensor,
@@ -143,7 +143,7 @@ class Measurement:
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
             "force_std": self.force_std, "base_axes": self.base_axes,
             "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
-            "averaged": self.averaged, "whole": None if self.whole is None else self.whole.to_tree(),
+            "averaged": self.averaged, "whole": self.whole and self.whole.to_tree(),
             "sample_rate": self.sample_rate,
         }  # fmt: skip
 
@@ -151,7 +151,7 @@ class Measurement:
     def from_tree(cls, tree: dict[str, Any]) -> Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
-        whole = WholeRecords.from_tree(tree["whole"])
+        whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole})
 
     @property
@@ -402,16 +402,11 @@ class Measurement:
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
-            whole = None
             if estimator == "records":
-                samples = tuple(run.base.shape[1] for run in records)
-                rest = per_run("at_rest", at_rest, len(records))
-                check_cuts(records, rest, G)
-                if noise is not None:
-                    noise = noise.of(len(records), G.shape[0], G.shape[1], force is not None)
-                whole = WholeRecords(samples, float(sample_rate), rest, noise)
-            rate = None if whole is not None else float(sample_rate)
-            test = cls(freq, base, response, force=force, whole=whole, sample_rate=rate, **given)
+                given["whole"] = whole_of(records, float(sample_rate), at_rest, noise, G)
+            else:
+                given["sample_rate"] = float(sample_rate)
+            test = cls(freq, base, response, force=force, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(

@@ -56,15 +56,12 @@ class NoiseLevels:
         Those given as a row a run stay so, (runs, channels); others are (channels,). Refused where there are levels of
         another number of channels, or none of a force that was measured.
         """
-        refuse(
-            (
-                force and self.force is None,
-                "noise states no level of the force, which was measured: NoiseLevels(force=...)",
-            )
-        )
-        given = {"response": n_sensors, "base": d} | ({"force": d} if force else {})
+        refuse((
+            force and self.force is None,
+            "noise states no level of the force, which was measured: NoiseLevels(force=...)",
+        ))  # fmt: skip
         levels = {}
-        for name, count in given.items():
+        for name, count in (("response", n_sensors), ("base", d), *[("force", d)] * force):
             value = getattr(self, name)
             refuse((
                 value.shape not in ((1,), (count,), (runs, count)),
@@ -78,10 +75,6 @@ class NoiseLevels:
     def outputs(self) -> Array:
         """Of responses and, behind them, forces, (n_sensors [+ d],) or a row of them a run."""
         return self.response if self.force is None else np.concatenate([self.response, self.force], axis=-1)
-
-    def to_tree(self) -> dict[str, Any]:
-        """Give the levels as a dictionary of arrays; ``NoiseLevels(**tree)`` takes it back."""
-        return {"response": self.response, "base": self.base, "force": self.force}
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +129,7 @@ class WholeRecords:
 
     def of_sensors(self, kept: NDArray[np.bool_]) -> WholeRecords:
         """That of some sensors."""
-        noise = self.noise
-        return replace(self, noise=None if noise is None else replace(noise, response=noise.response[..., kept]))
+        return replace(self, noise=self.noise and replace(self.noise, response=self.noise.response[..., kept]))
 
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
@@ -153,15 +145,13 @@ class WholeRecords:
             "samples": np.array(self.samples),
             "sample_rate": self.sample_rate,
             "at_rest": np.array(self.at_rest),
-            "noise": None if self.noise is None else self.noise.to_tree(),
+            "noise": self.noise and dict(vars(self.noise)),
         }
 
     @classmethod
-    def from_tree(cls, tree: dict[str, Any] | None) -> WholeRecords | None:
-        """Give what a tree of `to_tree` stands for; None for None."""
-        if tree is None:
-            return None
-        noise = None if tree["noise"] is None else NoiseLevels(**tree["noise"])
+    def from_tree(cls, tree: dict[str, Any]) -> WholeRecords:
+        """Give what a tree of `to_tree` stands for."""
+        noise = tree["noise"] and NoiseLevels(**tree["noise"])
         samples, rest = tuple(map(int, tree["samples"])), tuple(map(bool, tree["at_rest"]))
         return cls(samples, float(tree["sample_rate"]), rest, noise)
 
@@ -179,12 +169,20 @@ def check_options(estimator: str, *, at_rest: Any, noise: Any, segment: Any) -> 
     )
 
 
-def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:
-    """One bool, or one a run, as one a run."""
-    array = np.asarray([value] * runs if isinstance(value, bool | np.bool_) else value)
-    if array.shape != (runs,) or array.dtype != bool:
-        raise InputError(f"{name} = {value!r}: give True or False, or one of them for each of the {runs} runs")
-    return tuple(bool(one) for one in array)
+def whole_of(
+    runs: Sequence[TimeRun], sample_rate: float, at_rest: Any, noise: NoiseLevels | None, rigid_body: Array
+) -> WholeRecords:
+    """Properties of the whole records of a test, of what `Measurement.from_time` is told of them.
+
+    Refused where the ends of a run are not as they were recorded, see `check_cuts`.
+    """
+    count = len(runs)
+    rest = np.asarray([at_rest] * count if isinstance(at_rest, bool | np.bool_) else at_rest)
+    if rest.shape != (count,) or rest.dtype != bool:
+        raise InputError(f"at_rest = {at_rest!r}: give True or False, or one of them for each of the {count} runs")
+    check_cuts(runs, rest.tolist(), rigid_body)
+    levels = noise and noise.of(count, *rigid_body.shape, runs[0].force is not None)
+    return WholeRecords(tuple(run.base.shape[1] for run in runs), sample_rate, tuple(rest.tolist()), levels)
 
 
 _STILL = 8  # samples of one value in every channel that count as padding where the structure moved just before

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -67,8 +67,8 @@ class Geometry:
     recovery : ndarray, shape (n_sensors, n), optional
         From degrees of freedom to sensors, where they are not one and the same.
     weighed : ndarray, shape (d,) or callable, optional
-        Rigid-body mass a direction, or what finds it, that a measured base force suggests. A total that is not
-        stated is then an unknown, searched around it.
+        Rigid-body mass a direction, or what finds it, that a measured base force suggests: a total that is not stated
+        is then an unknown, searched around it.
     """
 
     def __init__(
@@ -117,14 +117,9 @@ class Geometry:
         return omega[: self.n]
 
     @property
-    def found(self) -> dict[str, Any] | None:
-        """The poles where they were found already, for storing; None where they were not."""
-        return asdict(self.poles) if "poles" in vars(self) else None
-
-    @found.setter
-    def found(self, tree: dict[str, Any] | None) -> None:
-        if tree is not None:
-            self.__dict__["poles"] = Poles(**tree)
+    def found(self) -> Poles | None:
+        """The poles where they were found already; None where they were not."""
+        return vars(self).get("poles")
 
     @cached_property
     def weighed(self) -> Array | None:
@@ -135,7 +130,7 @@ class Geometry:
         """The same with made-up poles and weights, to check what is declared before anything is searched."""
         other = Geometry(self.modal, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
         low = 1e-6 * self.test.freq[-1]  # within any limit that is stated
-        other.__dict__["poles"] = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
+        other.poles = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
         return other
 
     def weighing(self, totals: Array) -> Geometry:
@@ -262,17 +257,10 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Stated total masses.
+    """Stated total masses, (d,) kg a base direction (kg m² for rotations), or the whole rigid-body mass (d, d).
 
-    Attributes
-    ----------
-    values : (d,) or (d, d)
-        kg a base direction (kg m² for rotations), or the whole rigid-body mass.
-    kind : {"trace", "rigid_body", "sensors"}
-        What is summed: the diagonal over the direction's sensors and its base row; ``M_rb``; or the diagonal over the
-        sensors alone.
-    std : (d,) or (d, d) or None
-        Standard deviations; None where all are exact.
+    `kind` is what is summed: "trace", the diagonal over the direction's sensors and its base row; "rigid_body",
+    ``M_rb``; "sensors", the diagonal over the sensors alone. `std` are standard deviations, None where all are exact.
     """
 
     values: Array
@@ -348,13 +336,10 @@ class MassBlocks(NamedTuple):
 
 
 class FactoredMass(MassBlocks):
-    """Blocks of a mass whose Cholesky factor over sensors and base is known: ``M = whole whole'``.
+    """Blocks of a mass whose Cholesky factor over sensors and base is known: ``M = whole whole'``, (n + d, n + d).
 
-    Attributes
-    ----------
-    whole : expression (n + d, n + d) or None
-        The lower-triangular factor. A swarm takes participations and rigid-body mass from it, because ``L^-1 M_S0``
-        loses the digits of ``M_S0 = L Z'`` where L is ill-conditioned. None where blocks were changed afterwards.
+    A swarm takes participations and rigid-body mass from `whole`, because ``L^-1 M_S0`` loses the digits of
+    ``M_S0 = L Z'`` where L is ill-conditioned. None where blocks were changed afterwards.
     """
 
     whole: Any = None

@@ -88,11 +88,7 @@ class SpectrumDistance:
     f = sum_k f_k(lam_k) and T_jk = psi_j' dH psi_k its second differential in H is ``sum_jk F_jk T_jk²``, F_jk being
     the divided difference of f_j' and f_k' at lam_j and lam_k.
 
-    Parameters
-    ----------
-    n : int
-    targets : (m,), m <= n
-        Circular frequencies, ascending, in the unit of L_H.
+    The targets (m,), m <= n, are circular frequencies, ascending, in the unit of L_H (n, n).
     """
 
     def __init__(self, n: int, targets: Array) -> None:

@@ -321,8 +321,8 @@ class Variable(Unknown):
             sizes = tuple(0 if isinstance(size, bool) else operator.index(size) for size in given)
         except TypeError:
             sizes = (0,)
-        if len(sizes) > 2 or any(size < 1 for size in sizes):
-            self._refuse(f"its shape {shown(shape)} is not (), n or (n, m)")
+        wrong = len(sizes) > 2 or any(size < 1 for size in sizes)
+        self._refuse_where((wrong, f"its shape {shown(shape)} is not (), n or (n, m)"))
         return sizes
 
     def _flat(self, what: str, value: ArrayLike) -> Array:
@@ -331,11 +331,9 @@ class Variable(Unknown):
         try:
             array = np.broadcast_to(array.reshape(self.shape) if isinstance(value, ca.DM) else array, self.shape)
         except ValueError:
-            self._refuse(f"{what} = {shown(value)} is no number, nor numbers of its shape {self.shape}")
+            wrong = f"{what} = {shown(value)} is no number, nor numbers of its shape {self.shape}"
+            self._refuse_where((True, wrong))
         return array.ravel(order="F").copy()
-
-    def _refuse(self, what: str) -> None:
-        raise InputError(f"variable {self.name!r} ({self.declared}): {what}")
 
     def _refuse_where(self, *mistakes: tuple[Any, str]) -> None:
         refuse(*((applies, f"variable {self.name!r} ({self.declared}): {what}") for applies, what in mistakes))
@@ -473,13 +471,6 @@ def lower_of(unknowns: Iterable[Unknown]) -> Array:
 def upper_of(unknowns: Iterable[Unknown]) -> Array:
     """Upper bounds of all unknowns, one after the other."""
     return np.concatenate([np.zeros(0), *(v.upper for v in unknowns)])
-
-
-def box_of(unknowns: Iterable[Unknown]) -> tuple[Array, Array]:
-    """Lower and upper ends of what a swarm searches of all unknowns, one after the other."""
-    boxes = [v.box for v in unknowns]
-    low, high = ([np.zeros(0), *(box[end] for box in boxes)] for end in (0, 1))
-    return np.concatenate(low), np.concatenate(high)
 
 
 def slices_of(unknowns: Iterable[Unknown]) -> list[slice]:

@@ -278,10 +278,8 @@ class TestObjective:
             parts = matrices.of_modes(x)
             self._evaluate = Batch(self._error_of_modes(), _THREADS)
         else:
-            M, M_S0, M_00, K, C = matrices.function(x)[:5]
-            G = ca.DM(matrices.rigid_body)
-            push = M @ G + M_S0
-            parts = [M, K, C, push, G.T @ push + M_S0.T @ G + M_00, M_S0, M_00]
+            m = matrices.motion(x)
+            parts = [m.mass, m.stiffness, m.damping, m.push, m.rigid_body_mass, m.coupling, m.base]
         self._expand = Batch(expanded(ca.Function("expand", [x], [ca.densify(part) for part in parts])))
 
     def squared(self, particles: Array, spectrum: Array | None = None) -> Array:

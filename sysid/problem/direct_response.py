@@ -45,8 +45,8 @@ class Response(NamedTuple):
 def relative_response(test: Measurement, motion: Motion, *, shift: float = 0.0) -> tuple[Response, Response]:
     """Accelerations of the degrees of freedom relative to the base under a test's base motion, and the base force.
 
-    (n, runs * n_freq) in m/s², and (d, runs * n_freq) in N. With `shift`, 1/s, at the complex frequencies ``s = shift +
-    i w`` in the place of ``i w``: as if all poles had so much more decay.
+    (n, runs * n_freq) in m/s², and (d, runs * n_freq) in N. With `shift`, 1/s, at the complex frequencies
+    ``s = shift + i w`` in the place of ``i w``: as if all poles had so much more decay.
     """
     n, d = motion.rigid_body_dofs.shape
     F = test.freq.size

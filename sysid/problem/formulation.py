@@ -22,7 +22,7 @@ from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.model import Geometry, MatrixModel, Stated, ratios_of
-from sysid.models.unknowns import Unknown, Variable, box_of, expression_of, lower_of, split, upper_of, user_site
+from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site
 from sysid.problem.matrices import MATRICES, Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import (
     Builder,
@@ -199,7 +199,8 @@ class Formulation:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper ends of what a swarm searches, within the bounds, (size,) each."""
-        return box_of(self.unknowns)
+        low, high = (np.concatenate([np.zeros(0), *(v.box[end] for v in self.unknowns)]) for end in (0, 1))
+        return low, high
 
     @property
     def guess(self) -> Array:

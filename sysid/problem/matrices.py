@@ -14,7 +14,6 @@ from sysid.errors import InputError, finite_array, numbers, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, weighed_mass
-from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
 from sysid.models.mass import KnownMass, WrittenMass
 from sysid.models.model import (
@@ -28,7 +27,7 @@ from sysid.models.model import (
     ratios_of,
     stiffness_blocks,
 )
-from sysid.models.stiffness import WrittenStiffness
+from sysid.models.stiffness_and_damping import WrittenDamping, WrittenStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
 from sysid.structure.structure import Array, Structure
 
@@ -218,20 +217,12 @@ class Numbers(NamedTuple):
 class Matrices:
     """Matrices of the unknowns.
 
-    Attributes
-    ----------
-    function : casadi.Function
-        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n), C (n, n) or nothing, the Cholesky factor L (n, n) of
-        M_SS, and ``H = L^-1 K_SS L^-T`` (n, n).
-    ratio_function : casadi.Function
-        x and circular frequencies (n,) to damping ratios (n,), or to nothing where C tells them.
-    rigid_body : (n, d)
-        Motion of the degrees of freedom for unit base motion.
-    recovery : (n_sensors, n)
-    whole_factor : casadi.Function
-        x to the Cholesky factor of the whole mass (n + d, n + d), or to nothing where the model has none.
-    semidefinite : bool
-        M is positive semidefinite for every x, as its model makes it so.
+    `function` takes x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n), C (n, n) or nothing, the Cholesky factor L
+    (n, n) of M_SS, and ``H = L^-1 K_SS L^-T`` (n, n); `ratio_function` x and circular frequencies (n,) to damping
+    ratios (n,), or to nothing where C tells them; `whole_factor` x to the Cholesky factor of the whole mass (n + d, n +
+    d), or to nothing where the model has none. M is `semidefinite` where its model makes it positive semidefinite for
+    every x. `rigid_body` (n, d) is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n)
+    takes them to the sensors.
     """
 
     function: ca.Function

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Any
 
@@ -34,9 +34,9 @@ HELD = 1e-6  # of a constraint's scale: what counts as satisfied
 LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 
-def points_of(formulation: Formulation, count: int = 128) -> Array:
-    """The guess, and points spread over the search space, (count, size)."""
-    return np.array([formulation.guess, *spread_points(formulation, count - 1, np.random.default_rng(0))])
+def points_of(formulation: Formulation) -> Array:
+    """The guess, and points spread over the search space, (128, size)."""
+    return np.array([formulation.guess, *spread_points(formulation, 127, np.random.default_rng(0))])
 
 
 def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
@@ -258,21 +258,17 @@ class Prepared(SearchSpace):
     def _screened(self, monitor: Monitor | None) -> Prepared:
         if self.in_squares:
             return self
-        if self.stopped:
-            return Prepared(self.stated, self.modal, in_squares=True)
-        modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
+        modal = list(self.modal)
+        if not self.stopped:
+            modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in modal]
         return Prepared(self.stated, modal, in_squares=True)
 
     def _stop_screening(self) -> bool:
-        """Fit squares of whole records as they stand, as where the fit of their modes was stopped; False without any.
-
-        Their estimates say so from then on, and a stored result too.
-        """
+        """Fit squares of whole records from now on, as where the fit of their modes was stopped; False without any."""
         if self.in_squares or not any(one.by_modes for one in self.modal):
             return False
         self.modal = tuple(
-            one if one.record_fit is None else replace(one, record_fit=replace(one.record_fit, stopped=True))
-            for one in self.modal
+            replace(one, record_fit=one.record_fit and replace(one.record_fit, stopped=True)) for one in self.modal
         )
         return True
 
@@ -292,12 +288,10 @@ class Prepared(SearchSpace):
         """Each test that is fitted, and what the structure was in it at an answer."""
         formulation = self.formulation
         fitted = [(self.modal[0], structure)] if formulation.fits_records else []
-        further = () if x is None else formulation.further_tests
-        return fitted + [
-            (modal, term.matrices.structure(x, modal.records))
-            for modal, term in zip(self.modal[1:], further, strict=False)
-            if x is not None
-        ]
+        if x is None:
+            return fitted
+        further = zip(self.modal[1:], formulation.further_tests, strict=True)
+        return fitted + [(modal, term.matrices.structure(x, modal.records)) for modal, term in further]
 
     @property
     def first_test(self) -> int:
@@ -319,7 +313,8 @@ class Prepared(SearchSpace):
         tests = iter(pseudo_values(fits, self.n_variables))
         measurement = next(tests) if self.formulation.fits_records else self.measurement
         other = self.of_lines((measurement, *tests))
-        other.geometry.found = self.geometry.found
+        if self.geometry.found is not None:
+            other.geometry.poles = self.geometry.found
         return other
 
     def of_lines(self, tests: Iterable[Measurement]) -> Prepared:
@@ -461,5 +456,5 @@ class Prepared(SearchSpace):
         """That of the stated problem, with the poles that were found where the same records show them again."""
         given = all(one.records is one.given for one in self.screened.modal)
         poles = self.geometry.found if given else None
-        fits = [None if one.record_fit is None else one.record_fit.to_tree() for one in self.modal]
-        return {**self.stated.to_tree(), "poles": poles, "fits": fits}
+        fits = [one.record_fit and one.record_fit.to_tree() for one in self.modal]
+        return {**self.stated.to_tree(), "poles": poles and asdict(poles), "fits": fits}

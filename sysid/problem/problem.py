@@ -97,14 +97,14 @@ class Problem(StatedProblem, SearchSpace):
         problem = cls(
             Measurement.from_tree(tree["measurement"]),
             **stored.from_tree(tree["given"]),
-            reference=None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
+            reference=tree["reference"] and Structure.from_tree(tree["reference"]),
             validation=[Measurement.from_tree(test) for test in tree["validation"]],
             goal=tree["goal"],
             loss=tree["loss"],
         )
         vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:
-            problem.prepared.geometry.found = tree["poles"]
+            problem.prepared.geometry.poles = Poles(**tree["poles"])
         return problem
 
     @cached_property

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, as_float, choice, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.models.damping import ModalDamping
 from sysid.models.model import Geometry, MatrixModel
-from sysid.models.stiffness import SpectralStiffness
+from sysid.models.stiffness_and_damping import ModalDamping, SpectralStiffness
 from sysid.models.unknowns import Variable, user_site
 from sysid.problem import stored
 from sysid.problem.formulation import Formulation
@@ -113,7 +112,7 @@ class StatedProblem:
             "given": self.as_given,
             "poles": None,
             "fits": [],
-            "reference": None if self.reference is None else self.reference.to_tree(),
+            "reference": self.reference and self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
             "loss": self.loss,

@@ -18,11 +18,10 @@ import numpy as np
 
 from sysid.errors import InputError, refuse, shown
 from sysid.measurement.measurement import Measurement
-from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.expressions import as_matrix, is_column, is_expression
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import plain
-from sysid.models.stiffness import ChainStiffness, SpectralStiffness
+from sysid.models.stiffness_and_damping import ChainStiffness, ModalDamping, ProportionalDamping, SpectralStiffness
 from sysid.models.unknowns import Variable, variable_of
 from sysid.problem.decoding import decode
 from sysid.problem.encoding import NotStorableError, encode

@@ -77,19 +77,9 @@ class TestTerm:
     """The records of a test, each weighed by its noise.
 
     The weight of a record's channel and line is the inverse of its stated standard deviation, as a product of one
-    factor a channel and one a line of each run (`sysid.measurement.whole`): a diagonal weight matrix a line.
-
-    Attributes
-    ----------
-    modal : ModalEstimate
-        Of the test.
-    matrices : Matrices
-        Of the structure as it was in this test.
-    weight : float
-        Of the whole test, so that all tests count by their noise.
-    shift : float, 1/s
-        Of the complex frequencies s = shift + i w that the records are given at.
-    name : str
+    factor a channel and one a line of each run (`separable`): a diagonal weight matrix a line. `matrices` are those of
+    the structure as it was in this test; `weight` is that of the whole test, so that all tests count by their noise;
+    `shift`, 1/s, that of the complex frequencies s = shift + i w at which the records are given.
     """
 
     __test__ = False  # pytest takes names in Test for its own
@@ -117,16 +107,10 @@ class TestTerm:
         if self.modal.by_modes and self.modal.omega.size == omega.numel():
             gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
             weighed = self.test.force is not None
-            return (
-                self.weight
-                / size
-                * misfit_rows(self.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
-            )
-        miss = residual(
-            self.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True,
-            shift=self.shift,
-        )  # fmt: skip
-        return self.weight * miss
+            rows = misfit_rows(self.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
+            return self.weight / size * rows
+        modes_here = shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass
+        return self.weight * residual(self.test, *modes_here, weighted=True, shift=self.shift)
 
     @cached_property
     def batch(self) -> TestObjective:
@@ -175,20 +159,11 @@ class TestTerm:
 
 @dataclass(frozen=True, eq=False)
 class ExpressionTerm:
-    """A column of expressions.
+    """A column of expressions, `function` of x.
 
-    Attributes
-    ----------
-    name : str
-    function : casadi.Function
-        x to the column.
-    weight : float
-    std : float or None
-        Standard deviation of each row before it is weighed; None where it is not stated.
-    like_records : bool
-        A row that states none is as exact as a number of the records; else what the column leaves is its noise.
-    labels : tuple of str
-        What each row is called where rows are values known to some accuracy, less these, in standard deviations.
+    `std` is the standard deviation of each row before it is weighed, None where it is not stated: then a row is as
+    exact as a number of the records where `like_records`, else what the column leaves is its noise. `labels` are what
+    each row is called where rows are values known to some accuracy, less these, in standard deviations.
     """
 
     name: str
@@ -222,10 +197,8 @@ class ExpressionTerm:
         function = ca.Function("rows", [symbol], [ca.densify(column), ca.densify(ca.jacobian(column, symbol))])
         left, slope = (np.asarray(part) for part in function(x))
         left = left.ravel()
-        std = self.std
-        if std is None and self.like_records:
-            std = noise / self.weight
-        elif std is None:
+        std = noise / self.weight if self.std is None else self.std
+        if self.std is None and not self.like_records:
             std = max(float(np.linalg.norm(left)) / np.sqrt(max(left.size - x.size, 1)), 1e-15)
         return Rows(self.weight * left, self.weight * slope, np.full(left.size, self.weight * std))
 

@@ -26,7 +26,7 @@ from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
-from sysid.models.stiffness import FREQUENCY_WINDOW
+from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.matrices import assemble

@@ -18,7 +18,7 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
-from sysid.models.stiffness import FREQUENCY_WINDOW
+from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import Unknown, lower_of, scales_of, split, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble

@@ -54,8 +54,9 @@ def sensor_row(axis: str | ArrayLike, label: str) -> Array:
 
 def base_columns(base_axes: str | Iterable[str]) -> list[int]:
     """Return the indices 0 to 5 of the base axes: "xyz", "x rz" or ["x", "rz"]."""
-    names = base_axes if isinstance(base_axes, str) else sequence("base_axes", base_axes, "names such as ['x', 'rz']")
-    text = names if isinstance(names, str) else " ".join(n if isinstance(n, str) else repr(n) for n in names)
+    text = base_axes
+    if not isinstance(text, str):
+        text = " ".join(map(str, sequence("base_axes", base_axes, "names such as ['x', 'rz']")))
     if re.fullmatch(r"([\s,]*r?[xyz])+[\s,]*", text) is None:
         raise InputError(f"base_axes must be any of x y z rx ry rz, got {shown(base_axes)}")
     columns = [BASE_AXES.index(axis) for axis in re.findall(r"r?[xyz]", text)]

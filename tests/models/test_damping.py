@@ -6,8 +6,9 @@ import pytest
 
 import sysid
 from sysid import InputError, ModalDamping, ProportionalDamping
-from sysid.models.damping import WrittenDamping
+from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import MassBlocks, StiffnessBlocks
+from sysid.models.stiffness_and_damping import WrittenDamping
 
 SEEDS = range(5)
 
@@ -85,7 +86,7 @@ def test_modal_ratios_are_the_unknowns_and_there_is_no_matrix(geometry_of):
 
 def with_poles(geometry_of, ratios, n=4):
     geometry = geometry_of(np.ones((n, 1)))
-    geometry.found = {"omega": 1.0 + np.arange(len(ratios)), "ratios": np.array(ratios), "residual": 0.01}
+    geometry.poles = Poles(1.0 + np.arange(len(ratios)), np.array(ratios), 0.01)
     return geometry
 
 

@@ -10,7 +10,7 @@ from sysid import ChainStiffness, InputError, SpectralStiffness
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.model import FACTOR_FLOOR, Geometry, MassBlocks, stiffness_blocks
 from sysid.models.spectrum import Refinement
-from sysid.models.stiffness import WrittenStiffness
+from sysid.models.stiffness_and_damping import WrittenStiffness
 
 SEEDS = range(5)
 
@@ -105,7 +105,9 @@ class TestSpectral:
             Refinement(np.array([[1.0, 0.0], [2.0, 3.0]]), 0.0, True, "solved"),
             Refinement(np.array([[8.0, 0.0], [9.0, 8.0]]), 0.5, False, "not solved"),
         ])  # fmt: skip
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda factor, targets, max_time: next(answers))
+        monkeypatch.setattr(
+            "sysid.models.stiffness_and_damping.by_ipopt", lambda factor, targets, max_time: next(answers)
+        )
         rows = np.array([[5.0, 1.0, 6.0], [3.0, 0.0, 5.0]])
         refined, statuses = SpectralStiffness().with_spectrum(rows, np.array([4.0, 7.0]), by_solver=True)
         np.testing.assert_allclose(refined, [[1, 2, 3], [4, 0, 7]], atol=1e-12)

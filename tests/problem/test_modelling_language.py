@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.models.stiffness import check_rigid
+from sysid.models.stiffness_and_damping import check_rigid
 
 FREQ = np.linspace(1.0, 30.0, 25)
 MASSES, SPRINGS = np.array([3.0, 2.0, 1.0]), np.array([2e4, 1.5e4, 1e4])

@@ -8,7 +8,7 @@ import pytest
 import sysid
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.models.damping import ProportionalDamping
+from sysid.models.stiffness_and_damping import ProportionalDamping
 from sysid.problem.prepared import Prepared
 from sysid.search import modal_program
 from sysid.search.modal import degrees_of_freedom

@@ -28,7 +28,7 @@ def solved(monkeypatch):
         answers.append(by_ipopt(factor, targets, max_time))
         return answers[-1]
 
-    monkeypatch.setattr("sysid.models.stiffness.by_ipopt", spy)
+    monkeypatch.setattr("sysid.models.stiffness_and_damping.by_ipopt", spy)
     return answers
 
 
@@ -93,7 +93,7 @@ class TestLeaders:
         """An objective of rows that is lower, or higher, where IPOPT's factor (here twice the closed form's) stands."""
         omega = problem.formulation.stiffness.spectrum
         answer = Refinement(np.diag(omega[::-1]), 0.0, True, "Solve_Succeeded")
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda *_: answer)
+        monkeypatch.setattr("sysid.models.stiffness_and_damping.by_ipopt", lambda *_: answer)
         refiner, tally = made(problem, Tally())
         row = middle(problem)
         closed = refiner.rows(row[None])[0]
@@ -127,7 +127,7 @@ class TestLeaders:
             given.append(factor)
             return by_ipopt(factor, targets, max_time)
 
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", spy)
+        monkeypatch.setattr("sysid.models.stiffness_and_damping.by_ipopt", spy)
         refiner, _ = made(problem, Tally())
         row = middle(problem)
         refiner.of_leader(lambda rows: np.ones(len(rows)))(row, 1.0)
@@ -140,7 +140,7 @@ class TestLeaders:
 
     def test_a_leader_that_ipopt_does_not_solve_keeps_the_closed_form_and_is_counted(self, problem, monkeypatch):
         worse = Refinement(np.eye(3), 0.5, False, "Restoration_Failed")
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda *_: worse)
+        monkeypatch.setattr("sysid.models.stiffness_and_damping.by_ipopt", lambda *_: worse)
         result = search(problem)
         tried, won, statuses = counts(result.history)
         assert (won, statuses) == (0, {"Restoration_Failed": tried})
@@ -165,7 +165,7 @@ class TestLeaders:
             given.append(max_time)
             return by_ipopt(factor, targets, max_time)
 
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", spy)
+        monkeypatch.setattr("sysid.models.stiffness_and_damping.by_ipopt", spy)
         search(problem)
         assert set(given) == {None}
         given.clear()

@@ -14,7 +14,7 @@ from sysid.assessment.sensitivity import left_by_constraints, rows_of
 from sysid.errors import listed
 from sysid.finding import Finding, Severity, contradicting
 from sysid.modal_analysis.residues import Records
-from sysid.models.stiffness import FREQUENCY_WINDOW
+from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
 from sysid.problem.direct_response import stacked_rows
 from sysid.problem.formulation import Formulation
