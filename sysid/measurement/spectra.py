@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, finite_array, listed, numbers, refuse, sequence, whole_number
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array, ComplexArray, shaped_array
 
 
 class TimeRun(NamedTuple):
@@ -231,9 +231,8 @@ def resample(
         raise InputError("the records have no time in common; check that their clocks have one origin")
     time = start + np.arange(count) / rate
     if np.any(rates > 1.1 * rate):
-        for place, t in enumerate(clocks, start=1):
-            if t.size < 60:
-                raise InputError(f"record {place}: {t.size} samples are too few to low-pass before resampling")
+        few = "samples are too few to low-pass before resampling"
+        refuse(*((t.size < 60, f"record {place}: {t.size} {few}") for place, t in enumerate(clocks, start=1)))
         filters = [butter(8, 0.8 * rate / record_rate, output="sos") for record_rate in rates]
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
@@ -259,10 +258,7 @@ def _timed(name: str, entry: Any) -> tuple[Array, Array]:
 
 
 def _record(name: str, value: ArrayLike, channels: int) -> Array:
-    array = np.atleast_2d(finite_array(name, value))
-    if array.ndim != 2 or array.shape[0] != channels:
-        raise InputError(f"{name} has shape {array.shape}; ({channels}, n_samples) is needed")
-    return array
+    return shaped_array(name, np.atleast_2d(finite_array(name, value)), channels, "n_samples")
 
 
 def _smoothing(H: ComplexArray) -> Array:

@@ -23,7 +23,7 @@ from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.expressions import as_matrix, check_size, cholesky, square
 from sysid.models.unknowns import Unknown, variable_of
-from sysid.structure.structure import Array, Structure
+from sysid.structure.structure import Array, Structure, shaped_array
 
 # A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
 # condition number of 1e6, more than any test resolves.
@@ -224,9 +224,7 @@ class Geometry:
         """The rigid-body mass (d, d) where all of it is stated, else None."""
         if total_mass is None or np.ndim(total_mass) < 2:
             return None
-        given = np.array(total_mass, dtype=float)
-        if given.shape != (self.d, self.d):
-            raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")
+        given = shaped_array("total_mass", total_mass, self.d, self.d)
         size = np.sqrt(np.diag(given))
         scaled = given / np.outer(size, size)
         if np.abs(scaled - scaled.T).max() > 1e-9 or np.linalg.eigvalsh(scaled)[0] <= 0:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, numbers, refuse
+from sysid.errors import InputError, numbers, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, weighed_mass
@@ -29,7 +29,7 @@ from sysid.models.model import (
 )
 from sysid.models.stiffness_and_damping import WrittenDamping, WrittenStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
-from sysid.structure.structure import Array, Structure
+from sysid.structure.structure import Array, Structure, shaped_array
 
 MATRICES = ("mass", "stiffness", "damping")
 _WRITTEN: dict[str, Any] = {"mass": WrittenMass, "stiffness": WrittenStiffness, "damping": WrittenDamping}
@@ -113,9 +113,7 @@ def geometry_of(
                 "degrees of freedom belongs into mass, stiffness and damping, written in those of the sensors",
             )
         )
-    R = np.eye(test.n_sensors) if recovery is None else finite_array("recovery", recovery)
-    if R.ndim != 2 or len(R) != test.n_sensors:
-        raise InputError(f"recovery is {R.shape}; ({test.n_sensors}, n) takes n degrees of freedom to the sensors")
+    R = np.eye(test.n_sensors) if recovery is None else shaped_array("recovery", recovery, test.n_sensors, "n")
     G = _rigid_body_dofs(test, stiffness, R, recovery is not None, rigid_body_dofs)
     moved = np.abs(R @ G - test.rigid_body).max()
     if moved > 1e-6 * max(1.0, np.abs(test.rigid_body).max()):
@@ -130,10 +128,7 @@ def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other:
     """G of the degrees of freedom, (n, d): stated, or what a stiffness with its base columns has."""
     n, d = R.shape[1], test.n_base
     if stated is not None:
-        G = finite_array("rigid_body_dofs", stated)
-        if G.shape != (n, d):
-            raise InputError(f"rigid_body_dofs is {G.shape}; ({n}, {d}) is needed")
-        return G
+        return shaped_array("rigid_body_dofs", stated, n, d)
     if not other:
         return test.rigid_body
     whole = square("stiffness", stiffness.written) if isinstance(stiffness, WrittenStiffness) else ca.MX(n, n)

@@ -191,7 +191,7 @@ PLAIN = {
         lambda k: {"healing": {declare("stranger"): 2 * k}}, "no unknown of this problem"
     ),
     "healing in words": (lambda k: {"healing": {k: "twice"}}, "healing"),
-    "rigid_body_dofs of another shape": (lambda k: {"rigid_body_dofs": np.ones((3, 2))}, "rigid_body_dofs is (3, 2)"),
+    "rigid_body_dofs of another shape": (lambda k: {"rigid_body_dofs": np.ones((3, 2))}, "rigid_body_dofs has shape"),
     "rigid_body_dofs that do not fit": (lambda k: {"rigid_body_dofs": 2 * ONE}, "differs from the measurement's"),
     "a goal in words": (lambda k: {"goal": "small"}, "goal"),
     "a further test with a model": (
@@ -205,7 +205,7 @@ PLAIN = {
         "damping must be a matrix",
     ),
     "recovery of another shape with a known mass": (
-        lambda k: {"recovery": np.ones((2, 3)), "rigid_body_dofs": ONE}, "recovery is (2, 3)"
+        lambda k: {"recovery": np.ones((2, 3)), "rigid_body_dofs": ONE}, "recovery has shape (2, 3)"
     ),
     "recovery alone with a known mass": (lambda k: {"recovery": np.eye(3)}, "state rigid_body_dofs"),
     "a further test of another size": (
@@ -219,12 +219,12 @@ PLAIN = {
         lambda k: {"mass": k[0] * M, "recovery": np.eye(3)}, "state rigid_body_dofs"
     ),
     "recovery with too few rows": (
-        lambda k: {"mass": k[0] * M, "recovery": np.eye(3)[:2], "rigid_body_dofs": ONE}, "recovery is (2, 3)"
+        lambda k: {"mass": k[0] * M, "recovery": np.eye(3)[:2], "rigid_body_dofs": ONE}, "recovery has shape (2, 3)"
     ),
-    "recovery flat": (lambda k: {"mass": k[0] * M, "recovery": np.ones(3), "rigid_body_dofs": ONE}, "recovery is (3,)"),
+    "recovery flat": (lambda k: {"mass": k[0] * M, "recovery": np.ones(3), "rigid_body_dofs": ONE}, "(3,)"),
     "recovery in words": (lambda k: {"mass": k[0] * M, "recovery": "eye", "rigid_body_dofs": ONE}, "recovery"),
     "recovery of other degrees of freedom": (
-        lambda k: {"mass": k[0] * M, "recovery": np.ones((3, 2)), "rigid_body_dofs": ONE}, "(2, 1) is needed"
+        lambda k: {"mass": k[0] * M, "recovery": np.ones((3, 2)), "rigid_body_dofs": ONE}, "(2, 1)"
     ),
 }  # fmt: skip
 
