@@ -312,16 +312,11 @@ class Measurement:
         frf : array_like, complex, shape (n_sensors, d, n_freq)
             Transmissibility: absolute acceleration per unit base acceleration. With one base
             direction (n_sensors, n_freq) will do.
-        rigid_body : array_like, shape (n_sensors, d), optional
         force : array_like, complex, shape (d, d, n_freq), optional
             Apparent mass, kg: [force direction, base direction] per unit base acceleration.
-        sensors : sequence of Sensor, optional
-        response_std : array_like, optional
-            Standard deviation of `frf`, broadcast to (n_sensors, d, n_freq).
-        force_std : array_like, optional
-            Standard deviation of `force`, broadcast to (d, d, n_freq).
-        base_axes : str or sequence of str, optional
-        missing : {"refuse", "drop"}
+        response_std, force_std : array_like, optional
+            Standard deviations of `frf` and `force`, broadcast to them.
+        rigid_body, sensors, base_axes, missing
             As in `Measurement`.
         """
         lines = check_frequencies(freq)
@@ -364,8 +359,8 @@ class Measurement:
             Records (d, n_samples), (n_sensors, n_samples) and (d, n_samples); responses absolute.
         sample_rate : float
             Hz.
-        rigid_body : array_like, shape (n_sensors, d), optional
-            By default what `sensors` and `base_axes` tell.
+        rigid_body, sensors, base_axes
+            As in `Measurement`.
         estimator : {"records", "spectra", "h1", "h2"}
             "records" takes each run whole, of any length and cut anywhere, in motion too: its transients, two numbers a
             mode and run, and the noise of all channels, base and force included, are found with the modes. "spectra" is
@@ -383,8 +378,6 @@ class Measurement:
         band : (low, high), optional
             Hz, both ends included; by default all lines but zero, of "records" up to 0.4 of the sample rate, as motion
             that sampling folds back is largest above.
-        sensors : sequence of Sensor, optional
-        base_axes : str or sequence of str, optional
 
         Examples
         --------

@@ -113,16 +113,10 @@ def whole_record(
 def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment: int | None = None) -> Estimate:
     """H1 or H2 by Welch's method (Hann window, half overlap), several inputs at once.
 
-    H1 solves ``S_yx = H S_xx`` for all base directions together; H2 is ``S_yy / S_xy``, for one
-    base direction. The variance of an estimate from n_e effective averages is
-    ``(1 - coherence) S_yy [S_xx^-1]_ii / n_e`` (Bendat and Piersol, *Random Data*, ch. 9), n_e
-    counting the overlap as in Welch (1967). What the window blurs (`_smoothing`) is added.
-
-    Raises
-    ------
-    InputError
-        Too few segments for the number of inputs, base directions that are not independent, H2
-        with several base directions.
+    H1 solves ``S_yx = H S_xx`` for all base directions together; H2 is ``S_yy / S_xy``, for one base direction. The
+    variance of an estimate from n_e effective averages is ``(1 - coherence) S_yy [S_xx^-1]_ii / n_e`` (Bendat and
+    Piersol, *Random Data*, ch. 9), n_e counting the overlap as in Welch (1967). What the window blurs (`_smoothing`) is
+    added. Refused where there are too few segments, or base directions are not independent.
     """
     from scipy import signal
 

@@ -81,21 +81,11 @@ class NoiseLevels:
 class WholeRecords:
     """Properties of whole records beside their spectra; one entry a run.
 
-    A record of N samples neither starts nor ends at rest: its finite Fourier transform is the response to the base,
-    and two real numbers a mode, by which the motion at its end differs from that at its start.
-
-    Attributes
-    ----------
-    samples : tuple of int
-        N of each run; lines are multiples of ``sample_rate / N``.
-    sample_rate : float
-        Hz.
-    at_rest : tuple of bool
-        Runs that are stated to begin and end at rest, and have no such numbers.
-    noise : NoiseLevels or None
-        Stated; None where they are estimated with the fit.
-    varying : (runs, channels) of bool, or None
-        Sensors, forces and base directions whose level is found to vary over the lines; set by the fit, in no file.
+    A record of N `samples` neither starts nor ends at rest: its finite Fourier transform is the response to the base,
+    and two real numbers a mode, by which the motion at its end differs from that at its start; those stated to begin
+    and end `at_rest` have no such numbers. Lines are multiples of ``sample_rate / N``, Hz. `noise` is stated, or None
+    where it is estimated with the fit. `varying`, (runs, channels), are sensors, forces and base directions whose level
+    is found to vary over the lines; set by the fit, in no file.
     """
 
     samples: tuple[int, ...]

@@ -56,19 +56,10 @@ def check_sane(name: str, masses: Array) -> None:
 class Geometry:
     """The geometry of a test's degrees of freedom, and what its records tell before any model is fitted.
 
-    Poles and weights are found when they are first asked for, once.
-
-    Parameters
-    ----------
-    modal : ModalEstimate
-        Of the test.
-    rigid_body : ndarray, shape (n, d), optional
-        G, motion of the degrees of freedom for unit base motion; those of the sensors where it is not given.
-    recovery : ndarray, shape (n_sensors, n), optional
-        From degrees of freedom to sensors, where they are not one and the same.
-    weighed : ndarray, shape (d,) or callable, optional
-        Rigid-body mass a direction, or what finds it, that a measured base force suggests: a total that is not stated
-        is then an unknown, searched around it.
+    Poles and weights are found when they are first asked for, once. `rigid_body` (n, d), G, is the motion of the
+    degrees of freedom for unit base motion, `recovery` (n_sensors, n) takes them to the sensors; by default they are
+    the sensors. `weighed` is the rigid-body mass a direction (d,), or what finds it, that a measured base force
+    suggests: a total that is not stated is then an unknown, searched around it.
     """
 
     def __init__(
@@ -382,13 +373,7 @@ class MatrixModel(Protocol):
         """
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """The unknowns that stand for a structure's matrix: the inverse of `blocks`.
-
-        Raises
-        ------
-        InputError
-            Where there is none.
-        """
+        """The unknowns that stand for a structure's matrix: the inverse of `blocks`; refused where there is none."""
 
     def stated(self, geometry: Geometry) -> Stated:
         """Statement about the matrix."""
@@ -396,12 +381,9 @@ class MatrixModel(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """A matrix written in variables or numbers; each subclass has the blocks of one matrix.
+    """A matrix that is `written` in variables or numbers, (n, n), or with the base's rows last (n + d, n + d).
 
-    Parameters
-    ----------
-    written : expression or array_like
-        (n, n), or with the base's rows last (n + d, n + d).
+    Each subclass has the blocks of one matrix.
     """
 
     written: Any

@@ -393,12 +393,9 @@ class ProportionalDamping(FieldTree):
 
 
 class WrittenDamping(Written):
-    """Damping written in variables or numbers.
+    """Damping written in variables or numbers: C (n, n) on the motion relative to the base, or one ratio a mode, (n,).
 
-    Parameters
-    ----------
-    written : expression or array_like
-        C (n, n) on the motion relative to the base, base rows are cut off; or one ratio a mode, (n,).
+    Base rows of C are cut off.
     """
 
     name = "damping"

@@ -158,17 +158,10 @@ class BatchModes(NamedTuple):
 def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Array, BatchModes]:
     """Squared circular frequencies (count, n), ascending, and modes; a candidate that is no structure has NaN.
 
-    With ``H = Psi Lambda Psi'`` and L the Cholesky factor of M_SS, the modes are ``Phi = L^-T Psi`` and their
-    participations ``Phi' B = Psi' L^-1 B``, ``B = M_SS G + M_S0``.
-
-    Parameters
-    ----------
-    H : (count, n, n)
-        ``L^-1 K_SS L^-T``, the lower triangle at least; overwritten where it is not finite.
-    right : (count, n, n + d)
-        ``[L^-1, L^-1 B]``; `rigid` is the rigid-body mass, (count, d, d).
-    *base : (count, n, d), (count, d, d)
-        ``L^-1 M_S0`` and M_00, where the whole mass may be indefinite.
+    With ``H = Psi Lambda Psi'``, (count, n, n), and L the Cholesky factor of M_SS, the modes are ``Phi = L^-T Psi`` and
+    their participations ``Phi' B = Psi' L^-1 B``, ``B = M_SS G + M_S0``. H is overwritten where it is not finite; its
+    lower triangle counts. `right` is ``[L^-1, L^-1 B]`` (count, n, n + d), `rigid` the rigid-body mass (count, d, d);
+    `base`, where the whole mass may be indefinite, ``L^-1 M_S0`` (count, n, d) and M_00 (count, d, d).
     """
     n = H.shape[1]
     broken = ~np.isfinite(np.einsum("pij->p", H))

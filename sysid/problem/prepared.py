@@ -178,15 +178,9 @@ class SearchSpace:
 class Prepared(SearchSpace):
     """Statements of a user, and the modal estimate of each fitted test: what strategies search and checks judge.
 
-    Parameters
-    ----------
-    stated : StatedProblem
-    modal : sequence of ModalEstimate, optional
-        Of each of its tests, the problem's own first; found when first asked for where none are given.
-    in_squares : bool
-        Whether squares are fitted, whatever loss is stated.
-    fits : sequence of RecordFit or None, optional
-        Of whole records, of each test, of which its modal estimate is made when first asked for.
+    `modal` are the estimates of the tests, the problem's own first, found when first asked for where none are given;
+    `fits`, of whole records, are what they are then made of. With `in_squares` squares are fitted, whatever loss is
+    stated.
     """
 
     def __init__(

@@ -88,11 +88,8 @@ class Problem(StatedProblem, SearchSpace):
         """Make the problem of a tree that `to_tree` made: the same models, expressions, bounds and guesses.
 
         Models and matrices, expressions and their variables go through the constructor, as when they are written.
-
-        Raises
-        ------
-        InputError
-            Where the tree is damaged; NotRebuiltError where it lacks expressions, or the class of a model is not found.
+        Refused where the tree is damaged; a NotRebuiltError where it lacks expressions, or the class of a model is not
+        found.
         """
         problem = cls(
             Measurement.from_tree(tree["measurement"]),

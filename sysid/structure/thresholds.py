@@ -46,14 +46,8 @@ def round_off(terms: int) -> float:
 def beyond_chance(freedom: float, at_once: int = 1, chance: float = FALSE_ALARM) -> float:
     """Sum of squares of so many numbers of noise, in units of its variance, that chance does not reach.
 
-    Parameters
-    ----------
-    freedom : float
-        Degrees of freedom, or zero.
-    at_once : int
-        How many such sums are looked at, of which chance may let none through.
-    chance : float
-        That one of them is larger all the same.
+    Of `freedom` degrees, or none; `at_once` such sums are looked at, and `chance` is that one of them is larger all the
+    same.
     """
     least = sys.float_info.min  # for nothing to sum, of which the sum is zero
     return float(scipy.special.chdtri(max(freedom, least), chance / max(at_once, 1)))
