@@ -331,9 +331,10 @@ class Measurement:
         given = H, F, _std("response_std", response_std, H, read), _std("force_std", force_std, F, read)
         # The base direction comes first: it becomes the run.
         by_run: Any = [None if record is None else np.moveaxis(record, 1, 0) for record in given]
+        options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
         return cls(
-            lines, unit_runs(d, lines.size), by_run[0], rigid_body=rigid_body, force=by_run[1], sensors=sensors,
-            response_std=by_run[2], force_std=by_run[3], base_axes=base_axes, missing=missing,
+            lines, unit_runs(d, lines.size), by_run[0], force=by_run[1], response_std=by_run[2], force_std=by_run[3],
+            **options,
         )  # fmt: skip
 
     @classmethod

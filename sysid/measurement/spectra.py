@@ -303,7 +303,7 @@ def named(holes: dict[str, NDArray[np.bool_]], freq: Array, sensors: Sequence[st
     for name, hole in holes.items():
         names, channels = (sensors, len(sensors)) if name == "response" else ([name], 1)
         # Of a sensor all runs, of another record all its channels.
-        rows = hole.reshape(-1, channels, hole.shape[-1]).any(axis=0)
+        rows: NDArray[np.bool_] = np.any(hole.reshape(-1, channels, hole.shape[-1]), axis=0)
         found += [(one, freq[row]) for one, row in zip(names, rows, strict=True) if np.any(row)]
     return tuple(found)
 

@@ -166,12 +166,12 @@ def whole_of(
 
     Refused where the ends of a run are not as they were recorded, see `check_cuts`.
     """
-    count = len(runs)
+    count, (n, d) = len(runs), rigid_body.shape
     rest = np.asarray([at_rest] * count if isinstance(at_rest, bool | np.bool_) else at_rest)
     if rest.shape != (count,) or rest.dtype != bool:
         raise InputError(f"at_rest = {at_rest!r}: give True or False, or one of them for each of the {count} runs")
     check_cuts(runs, rest.tolist(), rigid_body)
-    levels = noise and noise.of(count, *rigid_body.shape, runs[0].force is not None)
+    levels = noise and noise.of(count, n, d, runs[0].force is not None)
     return WholeRecords(tuple(run.base.shape[1] for run in runs), sample_rate, tuple(rest.tolist()), levels)
 
 

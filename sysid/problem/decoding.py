@@ -210,7 +210,7 @@ class _Matrices:
         if name in operations.RESHAPING:
             return [operations.RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
         solver = name.partition(" ")[2]
-        others = {
+        others: dict[str, Callable[[list[ca.MX], list[int]], list[ca.MX]]] = {
             "const": self._const, "getnonzeros": self._getnonzeros, "setnonzeros": self._setnonzeros,
             "addnonzeros": self._addnonzeros, "einstein": self._einstein, "call": self._call,
             f"solve {solver}".strip(): partial(self._solve, solver),
