@@ -20,7 +20,7 @@ from sysid.results.lock import FILE_NAME as LOCK
 from sysid.results.lock import alone
 from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
-from sysid.search.deadline import TimeIsOver, within
+from sysid.search.session import TimeIsOver, within
 
 _SUMMARY = "summary.json"
 

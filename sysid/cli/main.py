@@ -35,8 +35,8 @@ from sysid.results.checkpoint import FILE_NAME as UNFINISHED
 from sysid.results.checkpoint import Checkpoint
 from sysid.results.version import __version__
 from sysid.search.auto import NAMED
-from sysid.search.refinement import RefineBy
 from sysid.search.session import GRACE, DeferredInterrupt
+from sysid.search.swarm_objective import RefineBy
 
 _LOG = "sysid-error.log"
 

@@ -20,7 +20,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
-from sysid.search import robust
+from sysid.search.auto import robust_fit
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
@@ -198,7 +198,7 @@ def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], s
         raise answer.stopped
     structure = problem.structure(answer.x)
     end = Outcome(structure, answer.x, "local phase", answer.success, answer.message, History(), None)
-    end = robust.fit(problem, end, Continuation(), session)
+    end = robust_fit(problem, end, Continuation(), session)
     if end.stopped is not None:
         raise end.stopped
     return end

@@ -29,7 +29,7 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
-from sysid.search.modal_scaling import stated_totals
+from sysid.search.modal_program import stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries

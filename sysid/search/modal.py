@@ -33,8 +33,15 @@ from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
-from sysid.search.modal_program import Spectrum, Ties, solve_modes
-from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.modal_program import (
+    Spectrum,
+    Ties,
+    nearest_lumped,
+    of_known_mass,
+    solve_modes,
+    stated_totals,
+    to_stated_totals,
+)
 from sysid.search.session import Session
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure

@@ -15,13 +15,11 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
-from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
-from sysid.search.refinement import RefineBy, Refiner, Tally
-from sysid.search.session import Session, in_time
+from sysid.search.session import Part, Session, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
-from sysid.search.swarm_objective import WORST, SwarmObjective
+from sysid.search.swarm_objective import WORST, RefineBy, Refiner, SwarmObjective, Tally
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
