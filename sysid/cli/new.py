@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib.machinery
 import keyword
@@ -10,9 +11,25 @@ import re
 import sys
 from pathlib import Path
 
+from sysid.cli.output import Output
+from sysid.cli.starting import SUCCESS
 from sysid.errors import InputError, refuse
 from sysid.files import recorded_test
 from sysid.results.storage import atomically
+
+
+def run(options: argparse.Namespace, out: Output) -> int:
+    """Write module and test, and tell what to do with them."""
+    module, test = write_new_problem(options.name, data=options.data)
+    out.wrote(module)
+    out.wrote(test)
+    out.write(
+        f"Try them, then change the steps of {module} into your own:\n"
+        f"  sysid show {module}    what is unknown, and what the data determine\n"
+        f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
+        f"  python -m pytest {test}\n"
+    )
+    return SUCCESS
 
 
 def write_new_problem(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
