@@ -50,6 +50,7 @@ from sysid.swarm import minimize_swarm
 K = 1e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 TRUTH = sysid.Structure(np.diag([2.0, 1.0, 0.0]), K, [0.01, 0.02], n_base=1)
 LINES = np.linspace(1.0, 9.0, 60)
+UNTRUSTED = Namespace(trust=False)
 TEST, FORCED = (sysid.simulate(TRUTH, LINES, force=force) for force in (False, True))
 
 MODULE = """import numpy as np
@@ -197,12 +198,12 @@ REFUSED = {
         "its own; 'auto' chooses another strategy",
     ),
     "an untrusted module": (
-        lambda: requests.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: requests.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", UNTRUSTED),
         "out/result.h5 names the problem module {here}/idle.py, whose code would run: say --trust where you know what "
         "stands in it, or name the module yourself: --module FILE.py",
     ),
     "a module that is gone": (
-        lambda: requests.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: requests.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", UNTRUSTED),
         "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
         "--module FILE.py",
     ),

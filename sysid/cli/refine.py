@@ -22,11 +22,10 @@ from sysid.errors import InputError
 from sysid.jobs.changes import Band, Change, NumberOfModes, WithoutRun, WithoutSensor
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
-from sysid.jobs.ledger import FILE_NAME as LEDGER
-from sysid.jobs.minima import Minimum, as_good, distinct
+from sysid.jobs.minima import Minimum, Spread, as_good, distinct, spreads
 from sysid.jobs.score import DECISIVE, Compared, Move, moves, scored
-from sysid.jobs.spread import Spread, spreads
-from sysid.jobs.submit import submit
+from sysid.jobs.submission import FILE_NAME as LEDGER
+from sysid.jobs.submission import submit
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe, load
@@ -177,7 +176,7 @@ def _write(
     folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
 ) -> None:
     """Write the ends of all starts as CSV, and the picture."""
-    from sysid.plot.refinement import minima as picture
+    from sysid.plot.comparison import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
     names = ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)
@@ -191,7 +190,7 @@ def _write(
 
 def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
-    from sysid.plot.refinement import draws as picture
+    from sysid.plot.comparison import draws as picture
 
     names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     each: list[Sequence[object]] = [names]
@@ -342,7 +341,7 @@ def report_sweep(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
-    from sysid.plot.refinement import sweep as picture
+    from sysid.plot.comparison import sweep as picture
 
     part = sweep.of_parts
     score = scored(result, np.nan if part else None)

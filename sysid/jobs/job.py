@@ -11,8 +11,7 @@ from sysid import catalogue
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
-from sysid.jobs.changes import Change, NumberOfModes
-from sysid.jobs.draws import drawn
+from sysid.jobs.changes import Change, NumberOfModes, drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared

@@ -28,9 +28,10 @@ from sysid.plot.canvas import (
     plain_log,
     positive,
 )  # fmt: skip
-from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
 from sysid.plot.panels import (
     draw,
+    draw_cmif,
+    draw_stabilisation,
     force_channel,
     key,
     named_index,
