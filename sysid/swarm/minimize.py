@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from enum import Enum
-from sysid.errors import as_float, whole_number
-from .particles import ParticleSwarm
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sysid.errors import InputError, RandomSource, function, refuse, whole_number
+
+from sysid.errors import InputError, RandomSource, as_float, function, refuse, whole_number
+
 from .adaptation import EvolutionaryState
+from .particles import ParticleSwarm
 from .settings import SwarmSettings, checked_costs, checked_rows
-from .stop import StopReason, StopRules
+
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 

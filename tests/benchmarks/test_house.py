@@ -54,7 +54,7 @@ def test_assessment_and_search_do_not_know_each_other_and_the_swarm_knows_errors
         "assessment/checks/against_records.py": "from sysid.search import local\n",
         "search/local.py": "from sysid.assessment import checks\n",
         "swarm/box.py": "from sysid.errors import InputError\nfrom . import stop\nfrom sysid import nlp\n",
-        "swarm/minimize.py": "",
+        "swarm/stop.py": "",
         "nlp.py": "",
         "errors.py": "",
     }
