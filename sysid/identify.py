@@ -112,7 +112,7 @@ def identify(
             chosen, why = choose(strategy, prepared, start)
             check_local_phase(prepared, chosen)
             follow = strategy == "auto" and not named
-            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow=follow)
+            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow)
             outcome, why = in_turn.run(chosen, why)
             outcome = robust_fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)

@@ -14,6 +14,7 @@ from sysid.problem.prepared import Prepared
 from sysid.results.identification import Identification
 from sysid.results.tables import labelled, quantities
 from sysid.search.continuation import apart
+from sysid.search.other_answers import entries_apart
 from sysid.structure.structure import Structure
 from sysid.structure.thresholds import EXACT, LIKELY, NEGLIGIBLE, SAME_ANSWER
 
@@ -65,13 +66,8 @@ def distinct(problem: Prepared, results: Iterable[JobResult]) -> list[Minimum]:
 
 def _matrices_apart(one: Structure, other: Structure) -> float:
     """Largest difference of entries of M, K and C, each over the root of the two diagonal entries."""
-    most = 0.0
-    for name in ("mass", "stiffness", "damping"):
-        a, b = getattr(one, name), getattr(other, name)
-        size = np.sqrt(np.maximum(np.abs(np.diag(a)), np.abs(np.diag(b))))
-        size[size == 0] = size.max() or 1.0  # a base without mass
-        most = max(most, float(np.max(np.abs(a - b) / np.outer(size, size))))
-    return most
+    pairs = ((one.mass, other.mass), (one.stiffness, other.stiffness), (one.damping, other.damping))
+    return max(entries_apart(a, b, np.maximum(np.abs(np.diag(a)), np.abs(np.diag(b)))) for a, b in pairs)
 
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:

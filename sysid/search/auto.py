@@ -7,7 +7,7 @@ squares of pseudo-values, again and again from the last answer, until it stays.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,27 +60,18 @@ def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[S
     raise InputError(f"no strategy applies: {'; '.join(refusals)}")
 
 
+@dataclass(frozen=True)
 class InTurn:
-    """A strategy, and under "auto" those after it while there is no good fit.
+    """A strategy, and under "auto", where others may `follow`, those after it while there is no good fit.
 
-    Parameters
-    ----------
-    problem : Prepared
-        In squares.
-    session : Session
-    start : array_like, Structure or None
-    mistakes : callable
-        Of the problem and a poor outcome the mistakes that explain it, so that no other strategy would do better.
-    follow : bool
-        Whether others may follow.
+    `mistakes` are those that explain a poor outcome, so that no other strategy would do better.
     """
 
-    def __init__(
-        self, problem: Prepared, session: Session, start: Start,
-        mistakes: Callable[[Prepared, Outcome], tuple[Finding, ...]], *, follow: bool,
-    ) -> None:  # fmt: skip
-        self.problem, self.session, self.start = problem, session, start
-        self.mistakes, self.follow = mistakes, follow
+    problem: Prepared  # in squares
+    session: Session
+    start: Start
+    mistakes: Callable[[Prepared, Outcome], tuple[Finding, ...]]
+    follow: bool
 
     def run(self, chosen: Strategy, why: str) -> tuple[Outcome, str]:
         """Where the best ended, and why it was taken."""
@@ -140,16 +131,8 @@ _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean s
 def robust_fit(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
     """Where Huber's loss is least, in so many rounds at most, from the answer to the screened records.
 
-    The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
-
-    Parameters
-    ----------
-    problem : Prepared
-    end : Outcome
-        Of a search in ``problem.screened``.
-    strategy : Strategy
-        With the settings of that search, as far as it was its own.
-    session : Session
+    The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns. `end` is
+    of a search in ``problem.screened``, and `strategy` has its settings, as far as it was its own.
     """
     if problem.in_squares or end.stopped is not None:
         return end
@@ -180,13 +163,7 @@ def robust_fit(problem: Prepared, end: Outcome, strategy: Strategy, session: Ses
 
 
 def check_local_phase(problem: Prepared, strategy: Strategy) -> None:
-    """Refuse settings that leave nothing to go on from.
-
-    Raises
-    ------
-    InputError
-        Where a swarm is to run without its local phase.
-    """
+    """Refuse a swarm without its local phase, which would leave nothing to go on from."""
     if problem.stated.loss == "huber" and isinstance(strategy, Swarm) and strategy.local is None:
         raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
 

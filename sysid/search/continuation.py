@@ -164,9 +164,8 @@ class _Run:
     def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
         """Search, and take the best end."""
         problem, session = self.problem, self.session
-        floor = (
-            "" if self.smoother is None else f"; free residues at the poles of the data leave {self.smoother.floor:.3g}"
-        )
+        of_data = self.smoother
+        floor = f"; free residues at the poles of the data leave {of_data.floor:.3g}" if of_data else ""
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         left_out = 0
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
@@ -269,15 +268,15 @@ def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence)
     if count < 1:
         return []
     points = spread_points(problem.formulation, DRAWN * count, np.random.default_rng(random))
-    return list(islice((x for x in points if _is_structure(problem, x)), count))
+    return list(islice((x for x in points if structure_of(problem, x) is not None), count))
 
 
-def _is_structure(problem: Prepared, x: Array) -> bool:
+def structure_of(problem: Prepared, x: Array) -> Structure | None:
+    """The structure that unknowns stand for; None where they stand for none."""
     try:
-        problem.structure(x)
+        return problem.structure(x)
     except InputError:
-        return False
-    return True
+        return None
 
 
 def _objective_at(problem: Prepared, x: Array) -> float:

@@ -72,16 +72,10 @@ def solve(
     smoothed: Sequence[TestTerm] = (),
     coordinates: Coordinates = "modal",
 ) -> LocalResult:
-    """Minimise the objective from the unknowns `x`.
+    """Minimise the objective from the unknowns `x`, in so many iterations of each attempt, and seconds of all.
 
     Parameters
     ----------
-    problem : Prepared
-    x : ndarray, shape (n_variables,)
-    max_iterations : int
-        Of each attempt.
-    max_time : float, optional
-        s, for all attempts.
     monitor : callable, optional
         Called with (iteration, objective) after each iteration; whatever it raises stops the solver
         and is handed back in `stopped`.
@@ -137,14 +131,10 @@ def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterat
 
 
 def _result(end: End, monitor: IterationMonitor) -> LocalResult:
-    words = [ended_in_words(end.status)]
-    if end.bounds:
-        words.append(f"ended on a bound: {end.bounds}")
-    if end.remark:
-        words.append(end.remark)
+    words = (ended_in_words(end.status), f"ended on a bound: {end.bounds}" * bool(end.bounds), end.remark)
     # At round-off IPOPT runs out of steps rather than of gradient.
     success = end.status in SOLVED or end.objective <= EXACT
-    return LocalResult(end.x, success, "; ".join(words), np.array(monitor.curve), monitor.stopped)
+    return LocalResult(end.x, success, "; ".join(filter(None, words)), np.array(monitor.curve), monitor.stopped)
 
 
 _JACOBIAN = 6e-7  # s of a processor, that the graph of a Jacobian takes for a row and the square of an unknown
@@ -195,10 +185,8 @@ def fit_in_matrices(
 
 def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[Term]:
     """All terms, with other records in the place of the tests', in their order; none given: as they are."""
-    if not smoothed:
-        return list(formulation.terms)
     others = iter(smoothed)
-    return [next(others) if isinstance(term, TestTerm) else term for term in formulation.terms]
+    return [next(others, term) if isinstance(term, TestTerm) else term for term in formulation.terms]
 
 
 def needs_modes(formulation: Formulation) -> bool:
