@@ -50,8 +50,6 @@ def solve_modes(
 
     Parameters
     ----------
-    modal : ModalEstimate
-        Of the test.
     first : Modes
         Where to start; shapes are not read.
     spectrum : callable

@@ -50,13 +50,7 @@ class Journal:
         self._unwritten = False
 
     def part(self, name: str) -> Part:
-        """Begin the next part.
-
-        Raises
-        ------
-        InputError
-            Where the earlier run had another one here.
-        """
+        """Begin the next part; an InputError where the earlier run had another one here."""
         number, self._next = str(self._next), self._next + 1
         found = self.entries.get(number)
         if found is not None and found["part"] != name:
@@ -87,25 +81,22 @@ class Journal:
         self._took, self._unwritten = self._written - start, False
 
 
+@dataclass(frozen=True, eq=False)
 class Part:
-    """One part of a search.
+    """One part of a search; `found` is what an earlier run kept of it."""
 
-    Attributes
-    ----------
-    found : dict or None
-        What an earlier run kept of it.
-    """
-
-    def __init__(self, journal: Journal, number: str, name: str, found: Tree | None) -> None:
-        self._journal, self._number, self._name, self.found = journal, number, name, found
+    journal: Journal
+    number: str
+    name: str
+    found: Tree | None
 
     def running(self, content: Callable[[], Tree]) -> None:
         """Keep its present state, where it is time to."""
-        self._journal.keep(self._number, self._name, content)
+        self.journal.keep(self.number, self.name, content)
 
     def ended(self, content: Callable[[], Tree]) -> None:
         """Keep its end, or its state where it is stopped."""
-        self._journal.keep(self._number, self._name, content, at_once=True)
+        self.journal.keep(self.number, self.name, content, at_once=True)
 
 
 class TimeIsOver(BaseException):  # no library's ``except Exception`` must take it
@@ -214,10 +205,7 @@ class DeferredInterrupt:
     Where somebody else handles the signal, or outside the main thread, nothing changes. Within another one this one
     answers the signal: it takes over what that one holds, and hands all back at its end.
 
-    Parameters
-    ----------
-    patience : int or None
-        How many are held; the next one acts at once, whatever is lost. None holds all.
+    So many are held as there is `patience`; the next one acts at once, whatever is lost. None holds all.
     """
 
     def __init__(self, patience: int | None = 2) -> None:
@@ -267,18 +255,8 @@ class DeferredInterrupt:
 class Session:
     """The clock, the log, the listeners and the random source of an identification.
 
-    Parameters
-    ----------
-    listeners : list of callable
-        Called with a `Progress` at each iteration.
-    interrupt : DeferredInterrupt
-    max_time : float or None
-        s.
-    random : SeedSequence
-    max_evaluations : int or None
-        Candidates that a swarm may evaluate.
-    journal : Journal, optional
-        Keeps what the search has reached.
+    Listeners are called with a `Progress` at each iteration; `max_time` is in s, `max_evaluations` the candidates that
+    a swarm may evaluate.
     """
 
     def __init__(
@@ -334,13 +312,7 @@ class Session:
         self.lines.append(f"{self.seconds:8.2f} s  {line}")
 
     def report(self, phase: Phase, iteration: int, of: int, objective: float, doing: str = "") -> None:
-        """Tell the listeners of an iteration.
-
-        Raises
-        ------
-        Stop, KeyboardInterrupt
-            Where a listener or the user wants to stop.
-        """
+        """Tell the listeners of an iteration; a Stop or KeyboardInterrupt where one or the user wants to stop."""
         self.interrupt.check()
         if self.stop_asked is not None and phase != "poles":
             raise self.stop_asked

@@ -166,13 +166,7 @@ class Swarm:
         return SwarmObjective(problem, steps[0] if steps else (), spectrum), steps
 
     def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
-        """Search, and again from another swarm while there is no good fit; the best.
-
-        Raises
-        ------
-        DoesNotApplyError
-            Where there are more modes in the data than sensors, or known entries or a whole rigid-body mass are stated.
-        """
+        """Search, and again from another swarm while there is no good fit; the best."""
         refusal = self.refusal(problem, start)
         if refusal:
             raise DoesNotApplyError(refusal)
@@ -238,17 +232,16 @@ class _Search:
         return self.problem.objective(self.found)
 
     @property
-    def meets_goal(self) -> bool | None:
-        """True where the residual is at or below the goal; None where none is given."""
-        if self.problem.stated.goal is None or self.x is None:
-            return None
-        return self.problem.residual(self.x) <= self.problem.stated.goal
+    def meets_goal(self) -> bool:
+        """True where there is a goal, and the residual is at or below it."""
+        goal = self.problem.stated.goal
+        return goal is not None and self.problem.residual(self.found) <= goal
 
     @property
     def good_enough(self) -> bool:
         """True where another swarm is not worth its time; never while no solver vouches for the best."""
         if self.problem.stated.goal is not None:
-            return self.success and self.meets_goal is True
+            return self.success and self.meets_goal
         return self.success and (not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL)
 
     def beats(self, other: _Search) -> bool:
@@ -402,7 +395,7 @@ class _Search:
         ended = not self.session.cut_short
         self.trapped = ended and self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
         if self.trapped:
-            self.success = self.success and self.meets_goal is True
+            self.success = self.success and self.meets_goal
             self.message += f"; {_TRAPPED}"
             if self.problem.measurement.force is not None and self.problem.formulation.mass.totals is not None:
                 self.message += ", or the stated total contradicts the base force"

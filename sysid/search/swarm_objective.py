@@ -43,16 +43,9 @@ _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the
 def held_spectrum_objective(
     problem: Prepared, term: Term, spectrum: Array | None, unknowns: ca.Function
 ) -> HeldSpectrumObjective | None:
-    """The fast objective of the problem's own test; None where it does not apply.
+    """The fast objective of the problem's own test, where all natural frequencies are held; None elsewhere.
 
-    It does where all natural frequencies are held.
-
-    Parameters
-    ----------
-    problem, term, spectrum
-        As in `HeldSpectrumObjective`; no spectrum where none is held.
-    unknowns : casadi.Function
-        The swarm's coordinates to the unknowns x.
+    `unknowns` takes the swarm's coordinates to x.
     """
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
@@ -68,7 +61,6 @@ class HeldSpectrumObjective:
 
     Parameters
     ----------
-    problem : Prepared
     term : TestTerm
         The problem's own test, or one in its place.
     spectrum : (n,), rad/s
@@ -80,12 +72,7 @@ class HeldSpectrumObjective:
     """
 
     def __init__(
-        self,
-        problem: Prepared,
-        term: TestTerm,
-        spectrum: Array,
-        expansion: ca.Function,
-        threads: int | None = None,
+        self, problem: Prepared, term: TestTerm, spectrum: Array, expansion: ca.Function, threads: int | None = None
     ) -> None:
         test = term.test
         batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
@@ -109,15 +96,7 @@ class HeldSpectrumObjective:
             self._expansions.put(copy(batch))
 
     def __call__(self, particles: Array, by_lines: Callable[[Array], Array]) -> Array:
-        """Of each candidate.
-
-        Parameters
-        ----------
-        particles : (count, n_variables)
-            Coordinates of the swarm.
-        by_lines : callable
-            The same summed over lines, for candidates near the records and those outside of the range of damping.
-        """
+        """Of each candidate; `by_lines` sums over lines, near the records and outside of the range of damping."""
         ends = chunk_ends(*particles.shape)
         chunks = self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)
         squared, inside = map(np.concatenate, zip(*chunks, strict=True))
@@ -192,15 +171,8 @@ class SwarmObjective:
     Constraints count by the feasibility rules of Deb (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever
     keeps them comes before what does not.
 
-    Parameters
-    ----------
-    problem : Prepared
-        Its healing is applied.
-    smoothed : sequence of TestTerm
-        In the place of the problem's tests, in their order.
-    spectrum : ndarray, optional
-        Circular frequencies, rad/s, that take the place of each candidate's own lowest ones (eigenvalue refinement in
-        closed form).
+    The healing of the problem is applied. `smoothed` are fitted in the place of its tests, in their order; a `spectrum`
+    (rad/s) takes the place of each candidate's own lowest frequencies (eigenvalue refinement in closed form).
     """
 
     def __init__(self, problem: Prepared, smoothed: Sequence[TestTerm] = (), spectrum: Array | None = None) -> None:
@@ -258,20 +230,11 @@ RefineBy = Literal["closed-form", "ipopt", "leaders"]
 
 @dataclass
 class Tally:
-    """Counts of the ends of IPOPT's refinements.
+    """Counts of the ends of IPOPT's refinements."""
 
-    Attributes
-    ----------
-    tried, won : int
-        Leaders of the swarm that IPOPT refined, and those of them that it left at a lower objective than the closed
-        form.
-    statuses : Counter
-        How often IPOPT ended with each status, whatever it refined.
-    """
-
-    tried: int = 0
-    won: int = 0
-    statuses: Counter[str] = field(default_factory=Counter)
+    tried: int = 0  # leaders of the swarm that IPOPT refined
+    won: int = 0  # those of them that it left at a lower objective than the closed form
+    statuses: Counter[str] = field(default_factory=Counter)  # of all that IPOPT refined
 
     def add(self, other: Tally) -> None:
         """Add the counts of another swarm."""
@@ -295,23 +258,15 @@ class Tally:
         self.tried, self.won, self.statuses = tree["tried"], tree["won"], Counter(tree["statuses"])
 
 
+@dataclass(frozen=True, eq=False)
 class Refiner:
-    """Gives candidates the measured spectrum.
+    """Gives candidates the measured spectrum."""
 
-    Parameters
-    ----------
-    problem : Prepared
-    by : {"closed-form", "ipopt", "leaders"}
-    spectrum : (m,), rad/s
-    session : Session
-        IPOPT keeps to the time that it has left.
-    tally : Tally
-        Takes the counts.
-    """
-
-    def __init__(self, problem: Prepared, by: RefineBy, spectrum: Array, session: Session, tally: Tally) -> None:
-        self.problem, self.by, self.spectrum, self.session, self.tally = problem, by, spectrum, session, tally
-        self._part, self._with_spectrum = problem.formulation.parts.stiffness, problem.formulation.with_spectrum
+    problem: Prepared
+    by: RefineBy
+    spectrum: Array  # (m,), rad/s
+    session: Session  # IPOPT keeps to the time that it has left
+    tally: Tally
 
     def rows(self, rows: Array) -> Array:
         """Rows (k, n_variables), of the swarm or of unknowns alike, with refined entries of L_H; counted."""
@@ -325,7 +280,8 @@ class Refiner:
 
     def error(self, x: Array) -> float:
         """Largest relative difference of the unknowns' eigenvalues from those that were given."""
-        return spectrum_error(triangle(x[self._part], self.problem.geometry.n), self.spectrum)
+        part = self.problem.formulation.parts.stiffness
+        return spectrum_error(triangle(x[part], self.problem.geometry.n), self.spectrum)
 
     def of_leader(self, objective: Callable[[Array], Array]) -> Callable[[Array, float], tuple[Array, float]]:
         """Function that refines a new leader, in the swarm's coordinates, for an objective of rows."""
@@ -350,7 +306,8 @@ class Refiner:
     def _refined(self, rows: Array, *, by_solver: bool) -> tuple[Array, tuple[str, ...]]:
         """Rows with refined entries of L_H, and IPOPT's status of each."""
         refined, left = rows.copy(), None if self.session.max_time is None else self.session.left
-        refined[:, self._part], statuses = self._with_spectrum(
-            rows[:, self._part], self.spectrum, by_solver=by_solver, max_time=left
+        part = self.problem.formulation.parts.stiffness
+        refined[:, part], statuses = self.problem.formulation.with_spectrum(
+            rows[:, part], self.spectrum, by_solver=by_solver, max_time=left
         )
         return refined, statuses
