@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import textwrap
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -53,59 +53,74 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output) -> int:
-    source = Path(options.result)
-    executor = _executor(options)
-    check_same_records(result, recipe)
-    sweep = sweep_of(options, result, recipe, out)
-    if sweep is not None:
-        titles, kind = [*sweep.titles], sweep.kind
-        jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
-    elif options.draws is not None:
-        if result.residual < EXACT:
-            raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        titles, kind = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
-        jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
-    else:
-        count = options.starts or 16
-        titles, kind = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
-        jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
-    out.write(f"{recipe.title}: {len(titles)} {kind.format(s='' if len(titles) == 1 else 's')}\n")
+    asked = _submitted(folder, result, recipe, options, out)
+    count = len(asked.titles)
+    out.write(f"{recipe.title}: {count} {asked.kind.format(s='' if count == 1 else 's')}\n")
     out.flush()
     try:
-        ends, interrupted = _ends(jobs, titles, out)
-        if interrupted and not ends:
-            pass  # there is nothing to tell
-        elif sweep is not None:
-            report_sweep(folder, result, recipe, sweep, ends, out)
-        elif options.draws is not None:
-            report_draws(folder, result, recipe, ends, out)
-        else:
-            minima = distinct(result.prepared, ends)
-            out.write(f"\n{minima_table(minima, len(ends))}\n\n")
-            out.answer(minima=[_figures(minimum) for minimum in minima])
-            _write(folder, recipe, ends, minima, result.problem, out)
+        ends, interrupted = _ends(asked, out)
+        if ends or not interrupted:
+            asked.report(ends)
         out.wrote(folder / LEDGER)
     except KeyboardInterrupt:
         out.complain(f"interrupted while saving; results are in {folder / LEDGER}: the same command writes the files")
         return INTERRUPTED
     if interrupted:
-        out.complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
+        out.complain(f"interrupted after {len(ends)} of {count} jobs; the same command goes on from there")
         return INTERRUPTED
-    # A model that is too simple is what a comparison may show.
-    reached = any(end.has_result if sweep is not None else end.success for end in ends)
-    return SUCCESS if reached else NOT_REACHED
+    return SUCCESS if any(map(asked.is_reached, ends)) else NOT_REACHED
 
 
-def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
+@dataclass(frozen=True)
+class _Submitted:
+    """Jobs that were submitted: what they are, and what is told of all of them."""
+
+    titles: Sequence[str]
+    kind: str  # in words; "{s}" is put in for the plural
+    jobs: Generator[JobResult, None, None]
+    report: Callable[[list[JobResult]], None]
+    is_reached: Callable[[JobResult], bool]
+
+
+def _submitted(
+    folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output
+) -> _Submitted:
+    """Submit the jobs that the command line asks for."""
+    send, source = functools.partial(submit, executor=_executor(options), out=folder), Path(options.result)
+    check_same_records(result, recipe)
+    sweep = sweep_of(options, result, recipe, out)
+    if sweep is not None:
+        jobs = send(sweep.recipes, changes=sweep.changes, strategy="auto")
+        # A model that is too simple is what a comparison may show.
+        return _Submitted(
+            sweep.titles, sweep.kind, jobs, lambda ends: report_sweep(folder, result, recipe, sweep, ends, out),
+            lambda end: end.has_result,
+        )  # fmt: skip
+    if options.draws is not None:
+        if result.residual < EXACT:
+            raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
+        word, count, kind = "draw", options.draws, "draw{s} of noise, each fitted from the result"
+        jobs, report = send(_started(recipe, source), draws=count), report_draws
+    else:
+        word, count, kind = "start", options.starts or 16, "start{s}, the first at the result"
+        jobs, report = send(_started(recipe, source), starts=count), report_minima
+    titles = [f"{word} {i:4d}" for i in range(count)]
+    return _Submitted(
+        titles, kind, jobs, lambda ends: report(folder, result, recipe, ends, out), lambda end: end.success
+    )
+
+
+def _ends(asked: _Submitted, out: Output) -> tuple[list[JobResult], bool]:
     """Tell the ends of jobs as they come, and give them by index; whether Ctrl-C ended that."""
     ends: list[JobResult] = []
     interrupted = False
     try:
-        with closing(jobs):  # also where Ctrl-C strikes while an end is told
-            for end in jobs:
+        with closing(asked.jobs):  # also where Ctrl-C strikes while an end is told
+            for end in asked.jobs:
                 ends.append(end)
                 left = f"residual {end.residual:.4e}" if end.has_result else "no result"
-                out.progress(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
+                count, title = f"{len(ends):4d} of {len(asked.titles)}", asked.titles[end.index]
+                out.progress(f"{count}  {title}  {left}  {end.message}\n")
     except KeyboardInterrupt:
         interrupted = True
     return sorted(ends, key=lambda one: one.index), interrupted
@@ -129,15 +144,6 @@ def minima_table(minima: list[Minimum], starts: int, most: int = 12) -> str:
     elif minima:
         lines.append(f"the best minimum was reached from {len(minima[0].results)} of {starts} starts")
     return "\n".join(lines)
-
-
-def _figures(minimum: Minimum) -> dict[str, Any]:
-    """A minimum for the JSON document."""
-    best = minimum.best
-    return {
-        "residual": best.residual, "reached": len(minimum.results), "success": best.success, "best_start": best.index,
-        "unknowns": best.x.tolist(),
-    }  # fmt: skip
 
 
 def _recipe(result: Identification, options: argparse.Namespace, source: Path, out: Output) -> Recipe:
@@ -172,33 +178,41 @@ def _executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
     return None if options.workers == 1 else processes(options.workers)
 
 
-def _write(
-    folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
-) -> None:
-    """Write the ends of all starts as CSV, and the picture."""
+def report_minima(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
+    """Print the minima of all starts, and write the starts and the picture."""
     from sysid.plot.comparison import minima as picture
 
+    minima = distinct(result.prepared, ends)
+    out.write(f"\n{minima_table(minima, len(ends))}\n\n")
+    figures = [
+        {"residual": it.residual, "reached": len(it.results), "success": it.best.success, "best_start": it.best.index,
+         "unknowns": it.best.x.tolist()}
+        for it in minima
+    ]  # fmt: skip
+    out.answer(minima=figures)
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
-    names = ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)
-    rows: list[Sequence[object]] = [names]
-    for end in ends:
-        left, minimum = repr(end.residual) if end.has_result else "", of.get(end.index, "")
-        rows.append((end.index, end.seed, end.success, left, minimum, end.message, *map(repr, end.x.tolist())))
-    drawn = png(picture, minima, recipe.title, goal=problem.goal) if minima else None
-    write_files(folder, {"starts.csv": table_as_csv(rows), "minima.png": drawn}, out)
+    drawn = png(picture, minima, recipe.title, goal=result.problem.goal) if minima else None
+    table = _as_rows("start", ends, result, minimum=[of.get(end.index, "") for end in ends])
+    write_files(folder, {"starts.csv": table, "minima.png": drawn}, out)
+
+
+def _as_rows(what: str, ends: list[JobResult], result: Identification, **more: Sequence[object]) -> bytes:
+    """A row an end as CSV, with `more` columns."""
+    rows: list[Sequence[object]] = [
+        (what, "seed", "success", "residual", *more, "message", *result.problem.formulation.labels)
+    ]
+    for end, *others in zip(ends, *more.values(), strict=True):
+        left = repr(end.residual) if end.has_result else ""
+        rows.append((end.index, end.seed, end.success, left, *others, end.message, *map(repr, end.x.tolist())))
+    return table_as_csv(rows)
 
 
 def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
     from sysid.plot.comparison import draws as picture
 
-    names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
-    each: list[Sequence[object]] = [names]
-    for end in ends:
-        left = repr(end.residual) if end.has_result else ""
-        each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
     count = sum(end.success for end in ends)
-    files: dict[str, bytes | None] = {"draws.csv": table_as_csv(each), "spreads.csv": None, "draws.png": None}
+    files: dict[str, bytes | None] = {"spreads.csv": None, "draws.png": None}
     if count < 2:
         out.write(f"\n{count} of {len(ends)} draws ended in a fit; two are needed for a spread\n\n")
     else:
@@ -212,7 +226,7 @@ def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: lis
         files["spreads.csv"] = table_as_csv(of_all)
         if any(np.isfinite(spread.ratio) for spread in found):
             files["draws.png"] = png(picture, found, count, recipe.title)
-    write_files(folder, files, out)
+    write_files(folder, {"draws.csv": _as_rows("draw", ends, result), **files}, out)
 
 
 def spread_table(found: Sequence[Spread], count: int, asked: int) -> str:
@@ -236,26 +250,17 @@ def spread_table(found: Sequence[Spread], count: int, asked: int) -> str:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Identifications beside a result.
+    """Identifications beside a result."""
 
-    Attributes
-    ----------
-    name : str
-        Of its files.
-    kind : str
-        Kind of the jobs, for the first line; "{s}" is to be put in for the plural.
-    titles : tuple of str
-        Of the jobs, in their order.
-    recipes : tuple of Recipe
-    changes : tuple of Change
-        Of the one recipe; empty where the recipes differ.
-    """
-
-    name: str
-    kind: str
-    titles: tuple[str, ...]
+    name: str  # of its files
+    kind: str  # of the jobs, for the first line; "{s}" is put in for the plural
     recipes: tuple[Recipe, ...]
-    changes: tuple[Change, ...] = ()
+    changes: tuple[Change, ...] = ()  # of the one recipe; empty where the recipes differ
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Of the jobs, in their order."""
+        return tuple(one.title for one in self.changes or self.recipes)
 
     @property
     def of_parts(self) -> bool:
@@ -274,7 +279,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
                     f"{one.title} has other records than the result: all have to read the same test (a variant is "
                     "built with the result's data, and with its own parameters as they are by default)"
                 )
-        return Sweep("variants", "other model{s} of the same records", tuple(one.title for one in recipes), recipes)
+        return Sweep("variants", "other model{s} of the same records", recipes)
     changes: tuple[Change, ...] = ()
     name = kind = ""
     if options.leave_out == "run":
@@ -291,7 +296,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
     if not changes:
         return None
     _check_possible(changes, result.problem)
-    return Sweep(name, kind, tuple(change.title for change in changes), (recipe,), changes)
+    return Sweep(name, kind, (recipe,), changes)
 
 
 def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], str]:
