@@ -137,7 +137,7 @@ def _add_run(command: Adder) -> None:
         help="of TEST.h5: mass of the structure, kg, a number or one a direction: 1450 or 1450,1450,1450; with "
         "--lumped that at the sensors alone, without what moves with the table (adapter, base ring)",
     )
-    run.add_argument("--lumped", action="store_true", help="of TEST.h5: masses at the sensors alone")
+    run.add_argument("--lumped", action="store_true", default=None, help="of TEST.h5: masses at the sensors alone")
     run.add_argument(
         "--band", type=_band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
     )
@@ -419,11 +419,12 @@ def _seconds(text: str) -> float:
     raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
 
 
-def _masses(text: str) -> list[float]:
+def _masses(text: str) -> float | list[float]:
+    """A mass, or one a direction."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
     if not found or min(found) <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is no mass in kg, such as 1450")
-    return found
+    return found if found[1:] else found[0]

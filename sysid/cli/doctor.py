@@ -42,25 +42,13 @@ for name in sys.argv[1:]:
 
 @dataclass(frozen=True)
 class Package:
-    """A package that sysid needs, always or for an extra.
-
-    Attributes
-    ----------
-    name, needed : str
-        `needed` is the least version.
-    extra : str
-        "" where it is always needed.
-    version : str
-        "" where it is not installed.
-    enough : bool
-        Whether it is installed, and late enough.
-    """
+    """A package that sysid needs, always or for an extra."""
 
     name: str
-    needed: str
-    extra: str
-    version: str
-    enough: bool
+    needed: str  # the least version
+    extra: str  # "" where it is always needed
+    version: str  # "" where it is not installed
+    enough: bool  # it is installed, and late enough
 
 
 def run(options: argparse.Namespace, out: Output) -> int:

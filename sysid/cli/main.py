@@ -38,18 +38,7 @@ _LOG = "sysid-error.log"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments; those of the process by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the command line, with the arguments of the process where none are given; the exit status."""
     given = sys.argv[1:] if argv is None else argv
     out = Output(json=JSON in given, quiet=QUIET in given)  # known before arguments are parsed, for what is wrong there
     with contextlib.redirect_stdout(cast(IO[str], out.prints)):

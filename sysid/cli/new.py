@@ -32,33 +32,15 @@ def run(options: argparse.Namespace, out: Output) -> int:
     return SUCCESS
 
 
-def write_new_problem(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
+def write_new_problem(name: str, *, data: str | None = None) -> tuple[Path, Path]:
     """Write ``NAME.py`` and ``test_NAME.py``, both whole or neither, and never over what is there.
 
-    Parameters
-    ----------
-    name : str
-        A Python identifier: the test imports the module by it.
-    folder : Path, optional
-        Where to; the current folder by default.
-    data : str, optional
-        A test that ``sysid read`` wrote: the module identifies it, in the place of a simulated one.
-
-    Returns
-    -------
-    tuple of Path
-        The module and its test.
-
-    Raises
-    ------
-    InputError
-        Where the name is no module's name, or one of the two files exists or cannot be written.
+    The test imports the module by its name. The module identifies the test `data`, which ``sysid read`` wrote, or a
+    simulated one.
     """
     _check(name)
-    folder = folder or Path()
-    named = {"NAME": name}
-    texts = [_filled(text, named | words) for text, words in _templates(data)]
-    module, test = folder / f"{name}.py", folder / f"test_{name}.py"
+    texts = [_filled(text, {"NAME": name, **words}) for text, words in _templates(data)]
+    module, test = Path(f"{name}.py"), Path(f"test_{name}.py")
     for path in (module, test):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already, so nothing was written: choose another name, or move it away")

@@ -31,18 +31,8 @@ _MODULE = "recorded_test"  # the bundled problem that takes what ``sysid read`` 
 def recipe_of(options: argparse.Namespace, out: Output, rng: int | None = None) -> Recipe:
     """The recipe that the arguments of a command make; ``data`` and ``rng`` may be set like parameters, too.
 
-    Parameters
-    ----------
-    options : Namespace
-        With the arguments of `add_arguments`.
-    out : Output
-    rng : int, optional
-        The seed of the simulated noise, where the command has an option of its own for it.
-
-    Raises
-    ------
-    InputError
-        Where something is not KEY=VALUE or is set twice: names the parameters of the module.
+    `rng` is the seed of the simulated noise, where the command has an option of its own for it. Where something is not
+    KEY=VALUE or is set twice, the InputError names the parameters of the module.
     """
     module = typed_module(options.problem, out)
     given: dict[str, str] = {}
@@ -81,22 +71,9 @@ def typed_module(name: str, out: Output) -> str:
 
 
 def check_trust(recipe: Recipe, source: Path, instead: str, options: argparse.Namespace) -> None:
-    """Refuse a recipe that a file holds, where its module may not run.
+    """Refuse a recipe that a file, `source`, holds, where its module is not of the package and nobody trusts it.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    source : Path
-        The file.
-    instead : str
-        How the module is named by the user, for the message.
-    options : Namespace
-        With `trust`.
-
-    Raises
-    ------
-    InputError
-        Where the module is not of the package, and nobody said that it may run.
+    `instead` tells how the user names the module.
     """
     if catalogue.is_bundled(recipe.module) or options.trust:
         return
@@ -113,13 +90,7 @@ def check_trust(recipe: Recipe, source: Path, instead: str, options: argparse.Na
 
 
 def read_result(options: argparse.Namespace, out: Output) -> Identification:
-    """The result; its problem made anew where a module is named.
-
-    Raises
-    ------
-    InputError
-        As of `load`; or where the module makes another problem than that of the result.
-    """
+    """The result; its problem made anew where a module is named, which has to make the same one."""
     result = load(options.result)
     if options.module is None:
         return result
@@ -143,19 +114,13 @@ def is_test(name: str | None) -> bool:
 
 def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
+    said = {name: getattr(options, name) for name in ("lumped", "mass", "band", "goal")}
+    extra = {name: value for name, value in said.items() if value is not None}
     if not is_test(given.module):
-        asked = options.lumped or any(one is not None for one in (options.mass, options.band, options.goal))
-        refuse((asked, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
+        refuse((extra, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
         return given
     refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
     recorded_test.load(given.module)  # told before anything is made
-    extra: dict[str, Any] = {"lumped": True} if options.lumped else {}
-    if options.mass is not None:
-        extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass
-    if options.band is not None:
-        extra["band"] = options.band
-    if options.goal is not None:
-        extra["goal"] = options.goal
     return Recipe(_MODULE, given.module, given.rng, {**given.parameters, **extra})
 
 
@@ -163,18 +128,17 @@ def folder_of(options: argparse.Namespace, out: Output) -> Path:
     """The folder of results that the arguments of ``run`` ask for."""
     if options.resume is None:
         return results_folder(options.out, Path("results") / _name(_asked(options, out).recipe))
-    if options.fresh or options.out is not None:
-        raise InputError(f"--resume and {'--fresh' if options.fresh else '--out'} exclude each other")
+    refuse(
+        (options.fresh, "--resume and --fresh exclude each other"),
+        (options.out is not None, "--resume and --out exclude each other"),
+    )
     return results_folder(options.resume, Path(options.resume))
 
 
 def requested_run(options: argparse.Namespace, folder: Path, out: Output) -> RunRequest:
     """The search that the arguments of ``run`` ask for, in the folder of its results.
 
-    Raises
-    ------
-    InputError
-        Where the folder holds an unfinished search and nothing is said of it, or another one than is to be resumed.
+    Refused where the folder holds an unfinished search and nothing is said of it, or another one than is to be resumed.
     """
     if options.resume is not None:
         return _resumed(options, folder, out)
@@ -195,13 +159,7 @@ def resuming_command(search: RunRequest, folder: Path) -> str:
 
 
 def strategy_of(search: RunRequest) -> str | Strategy:
-    """The strategy of a search, with the eigenvalue refinement that was chosen.
-
-    Raises
-    ------
-    InputError
-        Where one was chosen and the strategy has none.
-    """
+    """The strategy of a search, with the eigenvalue refinement that was chosen; refused where it has none."""
     if search.refine_by is None:
         return search.strategy
     chosen = NAMED[search.strategy]() if search.strategy in NAMED else None
@@ -216,11 +174,11 @@ def strategy_of(search: RunRequest) -> str | Strategy:
 def with_source(search: RunRequest, files: Collection[Path], folder: Path) -> RunRequest:
     """The search with the digest of the files that its problem was made from; refused where it began with others."""
     source = catalogue.digest(files)
-    if search.source not in ("", source):
-        raise InputError(
-            f"{folder} holds an unfinished run of {search}, and since it began its module or what this imports from "
-            f"beside itself was edited: give the problem with --out {folder} --fresh to begin anew, or undo the edit"
-        )
+    edited = (
+        f"{folder} holds an unfinished run of {search}, and since it began its module or what this imports from "
+        f"beside itself was edited: give the problem with --out {folder} --fresh to begin anew, or undo the edit"
+    )
+    refuse((search.source not in ("", source), edited))
     return replace(search, source=source)
 
 
@@ -236,16 +194,14 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunReque
         out.write(f"no unfinished run in {folder}: it begins anew\n")
         return asked
     tree = checkpoint.read()
-    if tree["begun"] is None:
-        raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
+    elsewhere = f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun"
+    refuse((tree["begun"] is None, elsewhere))
     search = RunRequest.from_tree(tree["begun"])
     given = (options.seed, options.strategy, options.refine_by, options.data)
     more = any(one is not None for one in given) or bool(options.settings)
     if asked is None:
-        if more:
-            raise InputError(
-                f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
-            )
+        kept = f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
+        refuse((more, kept))
         check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or is_test(options.problem), folder)
@@ -258,8 +214,7 @@ def _agreed(search: RunRequest, asked: RunRequest, whole: bool, folder: Path) ->
     wanted, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
     if not whole and wanted == its:
         return replace(search, recipe=replace(search.recipe, module=asked.recipe.module))
-    if asked != search:
-        raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
+    refuse((asked != search, f"{folder} holds an unfinished run of {search}, not of {asked}"))
     return search
 
 
@@ -270,8 +225,7 @@ def _name(recipe: Recipe) -> str:
 
 
 def _asked(options: argparse.Namespace, out: Output) -> RunRequest:
-    if options.problem is None:
-        raise InputError("PROBLEM is missing (see 'sysid run --help')")
+    refuse((options.problem is None, "PROBLEM is missing (see 'sysid run --help')"))
     recipe = _test_recipe(options, recipe_of(options, out))
     return RunRequest(recipe, options.strategy or "auto", options.seed or 0, options.refine_by)
 

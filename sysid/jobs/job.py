@@ -31,32 +31,17 @@ _BUILT = 4  # problems that a worker keeps
 
 @dataclass(frozen=True)
 class Job:
-    """Description of a job for a worker.
+    """Description of a job for a worker."""
 
-    Attributes
-    ----------
-    index : int
-        Among all jobs that were submitted together.
-    recipe : Recipe
-    start : int
-        0 is the recipe's own start where it has one; all others are fresh points of the search space.
-    source : str
-        Tells what one problem is made from, from another's.
-    draw : int
-        Of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves.
-    strategy : str
-        By which the problem is identified whole; empty for the local phase alone.
-    change : Change or None
-        Of the problem that is identified whole.
-    """
-
-    index: int
+    index: int  # among all jobs that were submitted together
     recipe: Recipe
-    start: int
-    source: str
-    draw: int = 0
-    strategy: str = ""
-    change: Change | None = None
+    start: int  # 0 is the recipe's own where it has one; all others are fresh points of the search space
+    source: str  # tells what one problem is made from, from another's
+    draw: int = (
+        0  # of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves
+    )
+    strategy: str = ""  # by which the problem is identified whole; empty for the local phase alone
+    change: Change | None = None  # of the problem that is identified whole
 
     @property
     def seed(self) -> int:
@@ -213,5 +198,4 @@ def _built(recipe: Recipe, source: str) -> Problem:
 def _widened(recipe: Recipe, source: str) -> list[tuple[TestTerm, ...]]:
     """Its tests with widened peaks, step by step, once a worker."""
     problem = _built(recipe, source).prepared
-    smoother = None if problem.free_modes else smoothed_tests(problem)
-    return [] if smoother is None else smoother.steps
+    return [] if problem.free_modes else smoothed_tests(problem).steps

@@ -159,9 +159,8 @@ class Swarm:
     def searched(self, problem: Prepared, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
         """Objective of the swarm, and the tests with widened peaks, if any, through which the local phase goes."""
         formulation = problem.formulation
-        smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
         # With wide peaks more of the swarm is on a slope that leads somewhere.
-        steps = [] if smoother is None else smoother.steps[1:]
+        steps = [] if formulation.refinable else smoothed_tests(problem, session.preparing).steps[1:]
         spectrum = formulation.stiffness.spectrum if self.refine and formulation.refinable else None
         return SwarmObjective(problem, steps[0] if steps else (), spectrum), steps
 
