@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, ended_in_words, time_too_short
+from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words, time_too_short
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
@@ -241,14 +241,5 @@ def _in_order(problem: Prepared, x: Array, shapes: Array, omega: Array, *, tied:
 
 def _gauss_newton(z: NonlinearProgram, miss: ca.MX) -> ca.Function:
     """Hessian of the Lagrangian with ``2 J'J`` for that of the objective (Gauss-Newton), as nlpsol's `hess_lag`."""
-    at = z.z
-    J = ca.densify(ca.jacobian(miss, at))
-    rows = ca.vertcat(ca.MX(0, 1), *z.constraints)
-    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
-    hessian = 2 * OBJECTIVE_SCALE * factor * (J.T @ J)
-    if rows.numel():
-        hessian = hessian + ca.hessian(ca.dot(multipliers, rows), at)[0]
-    return ca.Function(
-        "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
-        ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
-    )  # fmt: skip
+    J = ca.densify(ca.jacobian(miss, z.z))
+    return z.hessian(2 * (J.T @ J))

@@ -32,7 +32,7 @@ from sysid.modal_analysis.modal_estimate import (
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction, product
+from sysid.nlp import IterationMonitor, NonlinearProgram, NumpyFunction, product
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
@@ -251,20 +251,10 @@ def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunct
     # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
     slope = ca.MX.sym("slope", *error.rigid.shape)
     bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
-    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", sum(
-        tie.numel() for tie in z.constraints
-    ))  # fmt: skip
     return {
-        "grad_f": ca.Function(
-            "gradient", [unknowns, p], [OBJECTIVE_SCALE * error.value, OBJECTIVE_SCALE * error.gradient(unknowns)],
-            ["x", "p"], ["f", "grad_f_x"],
-        ),
-        "hess_lag": ca.Function(
-            "hessian", [unknowns, p, factor, multipliers],
-            [ca.triu(factor * OBJECTIVE_SCALE * (hessian + bend))],
-            ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
-        ),
-    }  # fmt: skip
+        "grad_f": z.gradient(error.value, error.gradient(unknowns)),
+        "hess_lag": z.hessian(hessian + bend, curved=False),
+    }
 
 
 _HELD = 1e5  # weight of known entries beside what is only likely
