@@ -4,10 +4,9 @@
 evaluate the costs themselves, stop, store and go on.
 """
 
-from .adaptation import EvolutionaryState
+from .adaptation import EvolutionaryState, SwarmSettings
 from .minimize import StopReason, SwarmProgress, minimize_swarm
 from .particles import ParticleSwarm
-from .settings import SwarmSettings
 
 __all__ = [
     "EvolutionaryState",

@@ -1,4 +1,4 @@
-"""The search box: units scaled to the range of each variable, and points spread over it."""
+"""The search box: units scaled to the range of each variable, points spread over it, checks of rows and costs."""
 
 from __future__ import annotations
 
@@ -125,3 +125,27 @@ def _lower_and_upper(bounds: Any) -> tuple[FloatArray, FloatArray]:
         i = reversed_[0]
         raise InputError(f"bounds[{i}] = ({lower[i]}, {upper[i]}) has its lower above its upper; exchange the two.")
     return lower, upper
+
+
+def checked_costs(costs: ArrayLike, n_rows: int, origin: str) -> FloatArray:
+    """The costs, (n_rows,) real numbers, as floats; `origin` follows "The costs" in an error."""
+    values = np.asarray(costs)
+    if values.shape != (n_rows,):
+        raise InputError(
+            f"The costs {origin} have shape {values.shape} for {n_rows} rows; give one a row, shape ({n_rows},)."
+        )
+    if values.dtype.kind not in "biuf":
+        raise InputError(
+            f"The costs {origin} have type {values.dtype}; give real numbers, such as the norm of a residual."
+        )
+    return values.astype(float)
+
+
+def checked_rows(rows: ArrayLike, shape: tuple[int, ...], origin: str) -> FloatArray:
+    """Rows of a shape as finite floats; `origin` follows "The rows" in an error."""
+    values = np.asarray(rows, dtype=float)
+    if values.shape != shape:
+        raise InputError(f"The rows {origin} have shape {values.shape}; give one a row that was asked for, {shape}.")
+    if not np.isfinite(values).all():
+        raise InputError(f"The rows {origin} are not all finite; leave a row that cannot be repaired as it was.")
+    return values

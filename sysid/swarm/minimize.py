@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, RandomSource, as_float, function, refuse, whole_number
 
-from .adaptation import EvolutionaryState
+from .adaptation import EvolutionaryState, SwarmSettings
+from .box import checked_costs, checked_rows
 from .particles import ParticleSwarm
-from .settings import SwarmSettings, checked_costs, checked_rows
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -333,7 +333,7 @@ class _Search:
             if self.improve is not None and swarm.nit % self.improve_every == 0 and math.isfinite(swarm.best_cost):
                 seen = self.refined is not None and np.array_equal(self.refined, swarm.best_x)
                 if not seen and rules.room_for(1, swarm.nfev):
-                    self.n_improved += _refine(swarm, self.fun, self.improve)
+                    self.n_improved += self._refine(self.improve)
                     self.refined = swarm.best_x
             reason = rules.reason(swarm, time.perf_counter() - started)
             if callback is not None:
@@ -353,6 +353,18 @@ class _Search:
             rows = repaired.copy()
         swarm.tell(checked_costs(self.fun(rows), len(rows), "that fun returned"), repaired)
 
+    def _refine(self, improve: Callable[[FloatArray], ArrayLike]) -> bool:
+        """Evaluate and inject the improved best point; return whether it was better."""
+        swarm = self.swarm
+        point = np.asarray(improve(swarm.best_x), dtype=float)
+        if point.shape != swarm.best_x.shape:
+            raise InputError(f"improve returned shape {point.shape}; return one point, shape {swarm.best_x.shape}.")
+        if not np.isfinite(point).all():
+            return False
+        point = swarm.box.clip(point)
+        cost = checked_costs(self.fun(point[None, :].copy()), 1, "that fun returned")[0]
+        return swarm.inject(point, float(cost))
+
     def _follow_leader(self) -> None:
         """Let `on_leader` put another point in the place of a new global best."""
         swarm = self.swarm
@@ -363,17 +375,3 @@ class _Search:
             if cost != swarm.best_cost or not np.array_equal(point, swarm.best_x):
                 swarm.replace_best(point, cost)
             self.led = swarm.best_x
-
-
-def _refine(
-    swarm: ParticleSwarm, fun: Callable[[FloatArray], ArrayLike], improve: Callable[[FloatArray], ArrayLike]
-) -> bool:
-    """Evaluate and inject the improved best point; return whether it was better."""
-    point = np.asarray(improve(swarm.best_x), dtype=float)
-    if point.shape != swarm.best_x.shape:
-        raise InputError(f"improve returned shape {point.shape}; return one point, shape {swarm.best_x.shape}.")
-    if not np.isfinite(point).all():
-        return False
-    point = swarm.box.clip(point)
-    cost = checked_costs(fun(point[None, :].copy()), 1, "that fun returned")[0]
-    return swarm.inject(point, float(cost))
