@@ -37,21 +37,11 @@ _FOREIGN = (sqlite3.SQLITE_ATTACH, sqlite3.SQLITE_FUNCTION)  # what no statement
 
 
 class Ledger:
-    """Results of some jobs, in a folder.
+    """Results of some jobs, in a folder, which is made where there is none.
 
     A job is known by sysid's version, its recipe, its start, draw or change, and `Job.source` (see `submit`):
-    where one of these differs it is another job. The file is open inside ``with`` alone.
-
-    Parameters
-    ----------
-    folder : Path
-        It is made where there is none.
-    jobs : sequence of Job
-
-    Raises
-    ------
-    InputError
-        Where the folder cannot be written, or its file is no ledger or damaged; later too, such as on a full disk.
+    where one of these differs it is another job. The file is open inside ``with`` alone. An InputError where the folder
+    cannot be written, or its file is no ledger or damaged; later too, such as on a full disk.
     """
 
     def __init__(self, folder: Path, jobs: Sequence[Job]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import (
     FAINT,
@@ -80,7 +80,7 @@ def response_channel(
     predicted = test.predict(identification.structure)[run, sensor] + test.rigid_body[sensor] @ test.base[run]
     unit = "–" if test.translational[run % test.n_base] else "m"
     words = test.sensor_names[sensor], f"transmissibility [{unit}]", "acceleration spectrum\n[m/s², own scale]"
-    std = _std(test, run, _band_of(test, band, test.n_sensors)[sensor])
+    std = _std(test, run, band, test.n_sensors, sensor)
     drawn = _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
     return drawn._replace(outliers=_outliers(identification, test, test.sensor_names[sensor], run))
 
@@ -99,7 +99,7 @@ def force_channel(
         f"apparent mass [{per_base}]",
         f"force spectrum\n[{unit}, own scale]",
     )
-    std = _std(test, run, _band_of(test, band, test.n_base)[direction])
+    std = _std(test, run, band, test.n_base, direction)
     largest = np.abs(test.force[:, direction]).max()
     drawn = _channel(test, test.force[run, direction], predicted, run, words, largest, std)
     return drawn._replace(outliers=_outliers(identification, test, f"force {test.base_axes[direction]}", run))
@@ -111,17 +111,12 @@ def _outliers(identification: Identification, test: Measurement, channel: str, r
     return np.array([one.freq for one in found if one[:3] == (1, run + 1, channel)])
 
 
-def _band_of(test: Measurement, band: ArrayLike | None, rows: int) -> Array:
-    """Check standard deviations of a test's spectra, (rows, d, n_freq); zeros where there are none."""
+def _std(test: Measurement, run: int, given: ArrayLike | None, rows: int, row: int) -> Array:
+    """Of a spectrum in one run, those of the answers to each direction alone `given`, (rows, d, n_freq), or zeros."""
     shape = (rows, test.n_base, test.freq.size)
-    std = np.zeros(shape) if band is None else np.asarray(band, float)
-    if std.shape != shape:
-        raise InputError(f"band has shape {std.shape}; standard deviations at the test's lines are {shape}")
-    return std
-
-
-def _std(test: Measurement, run: int, band: Array) -> Array:
-    """Of a spectrum in one run, `band` (d, n_freq) being that of the answer to each direction alone."""
+    std = np.zeros(shape) if given is None else np.asarray(given, float)
+    refuse((std.shape != shape, f"band has shape {std.shape}; standard deviations at the test's lines are {shape}"))
+    band = std[row]
     # Errors of different directions may add up whatever their phases: the sum is never too small.
     return np.sum(band * np.abs(test.base[run]), axis=0)
 
@@ -132,21 +127,17 @@ def _channel(
 ) -> PlottedChannel:  # fmt: skip
     """A channel of which `words` name the record, what it is for unit runs, and what it is for others."""
     name, per_base, spectrum = words
-    title = f"{name}, {run_names(test)[run]}"
+    title, at, gaps = f"{name}, {run_names(test)[run]}", np.ones(test.freq.size, bool), test.gaps
     negligible = bool(np.abs(measured).max() <= ROUND_OFF * largest)
-    if test.has_unit_runs:
-        ones = np.ones_like(measured)
-        return PlottedChannel(
-            test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0), test.gaps
-        )
-    moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
-    assert test.base_axes is not None
-    phase = f"phase to\nbase {test.base_axes[moved]} [°]"
-    # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
-    against = test.base[run, moved]
-    at, gaps = lines_of(test, run)
+    against, quantity, phase = np.ones_like(measured), per_base, "phase [°]"
+    if not test.has_unit_runs:
+        moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
+        assert test.base_axes is not None
+        # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
+        against, quantity, phase = test.base[run, moved], spectrum, f"phase to\nbase {test.base_axes[moved]} [°]"
+        at, gaps = lines_of(test, run)
     return PlottedChannel(
-        test.freq[at], measured[at], predicted[at], against[at], title, spectrum, phase, negligible, std[at],
+        test.freq[at], measured[at], predicted[at], against[at], title, quantity, phase, negligible, std[at],
         np.zeros(0), gaps,
     )  # fmt: skip
 
@@ -268,11 +259,10 @@ def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array
 def named_index(what: str, value: int | str, names: Sequence[str]) -> int:
     """Index of a name or of a number, which may count from the end; `what` it is, for the message of an InputError."""
     if isinstance(value, str):
-        if value not in names:
-            raise InputError(f"{what} {value!r} is unknown; there are {', '.join(names)}")
+        refuse((value not in names, f"{what} {value!r} is unknown; there are {', '.join(names)}"))
         return list(names).index(value)
-    if not -len(names) <= value < len(names):
-        raise InputError(f"{what} {value} is out of range: there are {len(names)}, counted from 0")
+    outside = not -len(names) <= value < len(names)
+    refuse((outside, f"{what} {value} is out of range: there are {len(names)}, counted from 0"))
     return int(value) % len(names)
 
 
@@ -301,8 +291,7 @@ def strongest(
 
 def with_force(test: Measurement) -> Measurement:
     """The measurement itself; an InputError where it has no base force."""
-    if test.force is None:
-        raise InputError("base_force: this measurement has no base force")
+    refuse((test.force is None, "base_force: this measurement has no base force"))
     return test
 
 

@@ -65,24 +65,12 @@ def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor
 
 
 class Coordinates(NamedTuple):
-    """A structure in the coordinates of this phase.
+    """A structure in the coordinates of this phase."""
 
-    Attributes
-    ----------
-    inverse : (n, n)
-        R, lower triangular; ``M_SS = (R'R)^-1``, kg^-½.
-    loads : (n, d)
-        P, kg^½ (times m for a rotation).
-    base : (d, d)
-        N, lower triangular.
-    psi : (n, n)
-        Eigenvectors of H, orthogonal.
-    """
-
-    inverse: Array
-    loads: Array
-    base: Array
-    psi: Array
+    inverse: Array  # R, (n, n), lower triangular; M_SS = (R'R)^-1, kg^-½
+    loads: Array  # P, (n, d), kg^½ (times m for a rotation)
+    base: Array  # N, (d, d), lower triangular
+    psi: Array  # eigenvectors of H, (n, n), orthogonal
 
 
 def coordinates_of(structure: Structure) -> Coordinates:
@@ -104,11 +92,6 @@ class InverseFactorError:
 
     The coordinates are one column: the entries of R, row by row, P by columns, the entries of N, row by row, where a
     base force was measured, the entries below the diagonal of the skew-symmetric S, log w (n,) and log zeta (n,).
-
-    Parameters
-    ----------
-    problem : Prepared
-        With free modes.
 
     Attributes
     ----------

@@ -342,12 +342,8 @@ def nearest_lumped(
 ) -> Array:
     """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
 
-    Parameters
-    ----------
-    P, gamma, G, groups :
-        As in `to_stated_totals`.
-    known : (m, m + d), optional
-        Entries of [M_SS, M_S0] to be met, NaN where there is none; where they fix all modal masses nothing else counts.
+    P, gamma, G and groups are those of `to_stated_totals`; `known` (m, m + d) are entries of [M_SS, M_S0] to be met,
+    NaN where there is none. Where they fix all modal masses nothing else counts.
     """
     from scipy.optimize import lsq_linear
 

@@ -43,30 +43,18 @@ _LESS, _MORE = 0.2, 5.0  # its change after a step that was taken, and after one
 class LeastSquares:
     """Levenberg and Marquardt's method from many starts in the unit box, all stepping together.
 
-    Parameters
-    ----------
-    rows : callable
-        (count, p) to residuals (count, m); what is not finite is never stepped to. What one point gives must not
-        depend on the others.
-    points : (count, p)
-        Starts within [0, 1]; then where each has come.
-
-    Attributes
-    ----------
-    left : (count,)
-        Norm of the residuals there.
-    idle : (count,)
-        Which have come to rest, as no step lowers what is left.
+    `rows` takes points (count, p) to residuals (count, m); what is not finite is never stepped to. What one point gives
+    must not depend on the others.
     """
 
     rows: Callable[[Array], Array]
-    points: Array
+    points: Array  # starts within [0, 1], (count, p); then where each has come
 
     def __post_init__(self) -> None:
         self._values = self.rows(self.points)
         self.left = _norms(self._values)
         self.damping = np.full(len(self.points), _FIRST)
-        self.idle: NDArray[np.bool_] = ~np.isfinite(self.left)
+        self.idle: NDArray[np.bool_] = ~np.isfinite(self.left)  # which have come to rest: no step lowers what is left
 
     def step(self) -> None:
         """One step of all that are not idle."""
@@ -121,12 +109,6 @@ class SameResponse:
 
     Responses relative to their size, further rows (what is stated as known, say) and broken constraints as the fit
     weighs them.
-
-    Parameters
-    ----------
-    problem : Prepared
-    x : (size,)
-        The answer.
     """
 
     def __init__(self, problem: Prepared, x: Array) -> None:
