@@ -8,7 +8,7 @@ from typing import Any
 
 from sysid.cli.output import Output
 from sysid.cli.starting import SUCCESS
-from sysid.errors import InputError, refuse
+from sysid.errors import refuse
 from sysid.files import description, recorded_test
 from sysid.files.reading import gather
 from sysid.results.storage import atomically
@@ -49,8 +49,7 @@ def _said(options: argparse.Namespace) -> Any:
     if options.sensor:
         given["sensor"] = [description.from_words(words) for words in options.sensor]
     file = Path(options.sensors) if options.sensors else description.description_file(Path(options.files[0]))
-    if options.sensor and options.sensors:
-        raise InputError("--sensor and --sensors exclude each other")
+    refuse((options.sensor and options.sensors, "--sensor and --sensors exclude each other"))
     if file is None or options.sensor:
         return description.description(given, "the command line")
     return description.description({**description.from_toml(file), **given}, str(file))

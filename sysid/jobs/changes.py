@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, as_float, whole_number
+from sysid.errors import InputError, as_float, refuse, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records
@@ -167,8 +167,8 @@ class NumberOfModes:
 
     def of(self, problem: Problem) -> Problem:
         """The problem itself, without the goal and the truth, which belong to all modes."""
-        if not problem.declared.free_modes:
-            raise InputError("the number of modes is open only where mass and stiffness are free")
+        held = not problem.declared.free_modes
+        refuse((held, "the number of modes is open only where mass and stiffness are free"))
         return replace(problem, goal=None, reference=None)
 
     def predicted(self, problem: Prepared, result: Identification) -> None:
@@ -180,17 +180,17 @@ Change = Band | WithoutRun | WithoutSensor | NumberOfModes
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     """The problem on another part of its test; a goal and the truth belonged to the whole one."""
-    if not problem.declared.fits_records:
-        raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
+    misfit = not problem.declared.fits_records
+    refuse((misfit, "the problem states a misfit of its own: what part of the records it reads is not known"))
     return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
 
 
 def _all_but(index: int, count: int, what: str) -> NDArray[np.bool_]:
     """Which of so many runs or sensors are left without one, (count,)."""
-    if index >= count:
-        raise InputError(f"there is no {what} {index + 1} ({what}={index}, counted from 0): the test has {count}")
-    if count == 1:
-        raise InputError(f"the test has one {what}; without it nothing is left")
+    refuse(
+        (index >= count, f"there is no {what} {index + 1} ({what}={index}, counted from 0): the test has {count}"),
+        (count == 1, f"the test has one {what}; without it nothing is left"),
+    )
     return np.arange(count) != index
 
 

@@ -21,7 +21,7 @@ from types import TracebackType
 from typing import Any
 
 from sysid import catalogue
-from sysid.errors import InputError, numbers, sequence, whole_number
+from sysid.errors import InputError, numbers, refuse, sequence, whole_number
 from sysid.jobs.changes import Change, check_drawable
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
@@ -184,17 +184,18 @@ def submit(
         distinct recipe is built here once, in a second or two, whatever its start.
     """
     recipes = list(recipe) if isinstance(recipe, Sequence) else [recipe]
-    if not recipes:
-        raise InputError("submit was given no recipe")
-    for one in recipes:
-        if not isinstance(one, Recipe):
-            raise InputError(
-                f"submit takes recipes, not a {type(one).__name__}: a job is rebuilt where it runs, so save the "
-                "problem as a module, problem.py, and give sysid.Recipe('problem.py')"
-            )
+    others = [type(one).__name__ for one in recipes if not isinstance(one, Recipe)]
+    refuse(
+        (not recipes, "submit was given no recipe"),
+        (
+            others,
+            f"submit takes recipes, not a {', '.join(others[:1])}: a job is rebuilt where it runs, so save the "
+            "problem as a module, problem.py, and give sysid.Recipe('problem.py')",
+        ),
+    )
     starts, draws = whole_number("starts", starts, at_least=1), whole_number("draws", draws, at_least=0)
-    if draws and (starts > 1 or any(one.start is None for one in recipes)):
-        raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
+    lacking = draws and (starts > 1 or any(one.start is None for one in recipes))
+    refuse((lacking, "draws need Recipe.start, the unknowns that were identified, and exclude starts"))
     if changes != ():
         changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor, NumberOfModes or None")
     by = _strategy(strategy, changes, starts > 1 or draws > 0)
@@ -220,12 +221,14 @@ def submit(
 def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> str:
     """The strategy of whole identifications; empty where none are asked for."""
     wrong = [type(change).__name__ for change in changes if not isinstance(change, Change | None)]
-    if wrong:
-        raise InputError(f"changes holds a {wrong[0]}; give Band, WithoutRun, WithoutSensor or NumberOfModes")
-    if others and (changes or strategy):
-        raise InputError("changes and strategy stand for whole identifications, and exclude starts and draws")
-    if strategy not in ("", "auto", *NAMED):
-        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
+    refuse(
+        (wrong, f"changes holds a {', '.join(wrong[:1])}; give Band, WithoutRun, WithoutSensor or NumberOfModes"),
+        (
+            others and (changes or strategy),
+            "changes and strategy stand for whole identifications, and exclude starts and draws",
+        ),
+        (strategy not in ("", "auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
+    )
     return strategy or ("auto" if changes else "")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError, Stop
+from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
@@ -37,10 +37,12 @@ Start = ArrayLike | Structure | None
 
 def check_strategy(strategy: str | Strategy) -> None:
     """Refuse what is no strategy, before anything is looked for."""
-    if not isinstance(strategy, str | Modal | Continuation | Swarm):
-        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings")
-    if isinstance(strategy, str) and strategy not in ("auto", *NAMED):
-        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
+    known, named = isinstance(strategy, Modal | Continuation | Swarm), isinstance(strategy, str)
+    other = f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings"
+    refuse(
+        (not (known or named), other),
+        (named and strategy not in ("auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
+    )
 
 
 def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[Strategy, str]:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, SolverError, Stop, sequence, whole_number
+from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
@@ -177,8 +177,7 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
         if not isinstance(at, int | np.integer) or not 0 <= at < len(names):
             raise InputError(f"Modal: {one!r} is no sensor; the sensors are {', '.join(names)}")
         chosen.append(int(at))
-    if len(set(chosen)) < len(chosen):
-        raise InputError("Modal: a sensor is named twice")
+    refuse((len(set(chosen)) < len(chosen), "Modal: a sensor is named twice"))
     return np.sort(np.array(chosen, dtype=int))
 
 

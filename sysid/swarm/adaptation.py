@@ -18,7 +18,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, as_float, whole_number
+from sysid.errors import as_float, refuse, whole_number
 
 FloatArray = NDArray[np.float64]
 
@@ -74,17 +74,15 @@ class SwarmSettings:
     def __post_init__(self) -> None:
         for field in fields(self):
             as_float(f"SwarmSettings.{field.name}", getattr(self, field.name), "a finite number >= 0", at_least=0)
-        if self.max_velocity == 0:
-            raise InputError("SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero.")
+        still = "SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero."
+        refuse((self.max_velocity == 0, still))
         whole_number("SwarmSettings.guides", self.guides, at_least=0)
-        if not 0 < self.guide_share <= 1:
-            raise InputError(f"SwarmSettings.guide_share is {self.guide_share!r}; give a part of the swarm, in (0, 1].")
+        no_part = f"SwarmSettings.guide_share is {self.guide_share!r}; give a part of the swarm, in (0, 1]."
+        refuse((not 0 < self.guide_share <= 1, no_part))
         for name in ("acceleration", "acceleration_step"):
             lower, upper = getattr(self, f"{name}_lower"), getattr(self, f"{name}_upper")
-            if lower > upper:
-                raise InputError(
-                    f"SwarmSettings.{name}_lower = {lower} is above {name}_upper = {upper}; exchange the two."
-                )
+            crossed = f"SwarmSettings.{name}_lower = {lower} is above {name}_upper = {upper}; exchange the two."
+            refuse((lower > upper, crossed))
 
 
 class EvolutionaryState(IntEnum):
