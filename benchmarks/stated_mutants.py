@@ -83,7 +83,7 @@ MISSED = (
     Mutant("J13", "sample rate rounded to three digits", 'near = float(f"{rate:.6g}")', 'near = float(f"{rate:.3g}")',
         "test_reading::test_the_rate_of_a_short_record_is_that_of_its_times"),
     Mutant("J15", "Gauss-Newton Hessian without that of the constraints",
-        "hessian = hessian + ca.hessian(ca.dot(multipliers, rows), at)[0]", "pass",
+        "hessian += ca.hessian(ca.dot(multipliers, rows), at)[0]", "pass",
         "test_local::TestStarts::test_the_gauss_newton_hessian_holds_the_constraints_own"),
 )  # fmt: skip
 

@@ -32,22 +32,12 @@ _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
 
 @dataclass(frozen=True)
 class Entry:
-    """A problem that can be run by its name.
-
-    Attributes
-    ----------
-    name : str
-    path : Path
-    bundled : bool
-        It comes with the package, and is not one of the user's own ``./problems``.
-    description : str
-        First line of the module's docstring.
-    """
+    """A problem that can be run by its name."""
 
     name: str
     path: Path
-    bundled: bool
-    description: str
+    bundled: bool  # it comes with the package, and is not one of the user's own ``./problems``
+    description: str  # first line of the module's docstring
 
 
 def bundled_folder() -> Path:

@@ -154,8 +154,7 @@ def choice(name: str, value: Any, known: Sequence[str | None]) -> None:
 
 def instance(name: str, value: Any, kind: type) -> None:
     """Refuse what is no object of this class of the package."""
-    if not isinstance(value, kind):
-        raise InputError(f"{name} is a {type(value).__name__}, not a sysid.{kind.__name__}")
+    refuse((not isinstance(value, kind), f"{name} is a {type(value).__name__}, not a sysid.{kind.__name__}"))
 
 
 def function(name: str, value: Any) -> None:

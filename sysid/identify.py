@@ -22,11 +22,17 @@ from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
 from sysid.results.stated_masses import with_stated_masses
-from sysid.search import robust
-from sysid.search.auto import InTurn, check_strategy, choose
-from sysid.search.deadline import regularly
-from sysid.search.journal import Journal
-from sysid.search.session import DeferredInterrupt, Progress, Session, limits_of, listeners_of, seed_of
+from sysid.search.auto import InTurn, check_local_phase, check_strategy, choose, robust_fit
+from sysid.search.session import (
+    DeferredInterrupt,
+    Journal,
+    Progress,
+    Session,
+    limits_of,
+    listeners_of,
+    regularly,
+    seed_of,
+)
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
 
@@ -104,11 +110,11 @@ def identify(
             prepare(prepared, session)
         with _telling_why(session, named, prepared):
             chosen, why = choose(strategy, prepared, start)
-            robust.check_local_phase(prepared, chosen)
+            check_local_phase(prepared, chosen)
             follow = strategy == "auto" and not named
-            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow=follow)
+            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow)
             outcome, why = in_turn.run(chosen, why)
-            outcome = robust.fit(prepared, outcome, chosen, session)
+            outcome = robust_fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)
         outcome = replace(outcome, findings=(*named, *outcome.findings))
         result = judge(problem, prepared, outcome, f"strategy {why}", seed, session)

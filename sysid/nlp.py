@@ -90,18 +90,9 @@ def product(one: ca.MX, other: ca.MX) -> ca.MX:
 
 
 class NumpyFunction(ca.Callback):
-    """A function of one column that NumPy computes, as CasADi calls it.
+    """A function of one column that NumPy computes, as CasADi calls it: of its size to values of these shapes.
 
     It must live as long as what calls it: CasADi holds no Python object.
-
-    Parameters
-    ----------
-    size : int
-        Of the column.
-    shapes : sequence of (rows, columns)
-        Of its values.
-    call : callable
-        The values at a column (size,).
     """
 
     def __init__(
@@ -151,6 +142,42 @@ class NonlinearProgram:
         """All unknowns, (p, 1)."""
         return ca.vertcat(*self.pieces)
 
+    @property
+    def rows(self) -> ca.MX:
+        """All constraints, a column."""
+        return ca.vertcat(ca.MX(0, 1), *self.constraints)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of all unknowns, (p,) each."""
+        return np.concatenate(self.lower), np.concatenate(self.upper)
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of all constraints."""
+        below, above = (np.concatenate([np.zeros(0), *part]) for part in (self._lower, self._upper))
+        return below, above
+
+    def gradient(self, value: ca.MX, slope: ca.MX) -> ca.Function:
+        """An objective's value and gradient by the unknowns, as nlpsol's `grad_f`, in IPOPT's scale."""
+        outputs = [OBJECTIVE_SCALE * value, OBJECTIVE_SCALE * slope]
+        return ca.Function("gradient", [self.z, ca.MX.sym("p", 0)], outputs, ["x", "p"], ["f", "grad_f_x"])
+
+    def hessian(self, of_objective: ca.MX, *, curved: bool = True) -> ca.Function:
+        """Hessian of the Lagrangian with that of the objective as given, as nlpsol's `hess_lag`.
+
+        That of the constraints is CasADi's own, and left out where they are not to count as `curved`.
+        """
+        at, rows = self.z, self.rows
+        p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
+        hessian = OBJECTIVE_SCALE * factor * of_objective
+        if curved and rows.numel():
+            hessian += ca.hessian(ca.dot(multipliers, rows), at)[0]
+        return ca.Function(
+            "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
+            ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
+        )  # fmt: skip
+
     def variable(
         self,
         name: str,
@@ -195,13 +222,10 @@ class NonlinearProgram:
         that five iterates in a row must meet, in units of the tolerance; `barrier` is IPOPT's way to lower its barrier
         parameter. Where the monitor was stopped the status is "stopped", and the unknowns are the last iterate's.
         """
-        z = self.z
-        constraints = ca.vertcat(ca.MX(0, 1), *self.constraints)
-        nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": constraints}
-        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
-        bounds_below, bounds_above = (np.concatenate([np.zeros(0), *part]) for part in (self._lower, self._upper))
+        nlp = {"x": self.z, "f": OBJECTIVE_SCALE * objective, "g": self.rows}
+        (lower, upper), (below, above) = self.bounds, self.limits
         start = np.clip(np.concatenate(self.start), lower, upper)
-        call = monitor.callback(start, constraints.numel())
+        call = monitor.callback(start, below.size)
 
         def run(at: Array, tolerance: float) -> tuple[str, Array]:
             limits = {"max_wall_time": max(monitor.left, 0.1)} if np.isfinite(monitor.left) else {}
@@ -211,7 +235,7 @@ class NonlinearProgram:
             )  # fmt: skip
             options = {**quiet, "iteration_callback": call, **(derivatives or {})}
             solver = ca.nlpsol("local", "ipopt", nlp, options)
-            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=bounds_below, ubg=bounds_above)
+            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=below, ubg=above)
             status = solver.stats()["return_status"]
             return _LATE if status == "User_Requested_Stop" else status, np.asarray(answer["x"]).ravel()
 
@@ -232,10 +256,8 @@ class NonlinearProgram:
         For small residuals: a step solves the linear least squares by orthogonal factors, so that neither squares nor a
         barrier hide what `rows` hardly shows. Equalities are kept; a step over a bound is not taken.
         """
-        below, above = (np.concatenate([np.zeros(0), *part]) for part in (self._lower, self._upper))
-        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
-        held = below == above
-        g = ca.vertcat(ca.MX(0, 1), *self.constraints)
+        (lower, upper), (below, above) = self.bounds, self.limits
+        held, g = below == above, self.rows
         outputs = [rows, ca.densify(ca.jacobian(rows, self.z)), g, ca.densify(ca.jacobian(g, self.z))]
         function = ca.Function("rows", [self.z], outputs)
         best, left, violated = at, np.inf, np.inf
@@ -253,7 +275,7 @@ class NonlinearProgram:
 
     def on_bounds(self, at: Array) -> str:
         """Which unknowns press against a finite bound at a solution, in words."""
-        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        lower, upper = self.bounds
         free = upper > lower  # what is held fixed rests on no bound
         with np.errstate(invalid="ignore"):
             near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
@@ -268,12 +290,8 @@ class NonlinearProgram:
 class IterationMonitor:
     """Monitor of the iterations of all runs of IPOPT: the curve, the listener, and its wish to stop.
 
-    Parameters
-    ----------
-    listener : callable or None
-        Called with (iteration, objective) after each iteration; whatever it raises stops the solver.
-    max_time : float or None
-        s, for all runs and what is made before them.
+    The listener is called with (iteration, objective) after each iteration; whatever it raises stops the solver.
+    `max_time`, in s, is for all runs and what is made before them.
     """
 
     def __init__(self, listener: Callable[[int, float], object] | None, max_time: float | None) -> None:
@@ -335,14 +353,6 @@ class _IterationCallback(ca.Callback):
     def get_n_out(self) -> int:
         """Give one flag."""
         return 1
-
-    def get_name_in(self, i: int) -> str:
-        """Name an nlpsol output."""
-        return str(ca.nlpsol_out(i))
-
-    def get_name_out(self, i: int) -> str:
-        """Name the flag."""
-        return "stop"
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         """Shapes of the nlpsol outputs."""

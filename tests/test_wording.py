@@ -30,7 +30,7 @@ from sysid import (
     catalogue,
     errors,
 )
-from sysid.cli import doctor, refine, sweeps, trust, unfinished
+from sysid.cli import doctor, refine, requests
 from sysid.cli import main as cli
 from sysid.cli.files import alone_in, results_folder
 from sysid.cli.output import Output
@@ -50,6 +50,7 @@ from sysid.swarm import minimize_swarm
 K = 1e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 TRUTH = sysid.Structure(np.diag([2.0, 1.0, 0.0]), K, [0.01, 0.02], n_base=1)
 LINES = np.linspace(1.0, 9.0, 60)
+UNTRUSTED = Namespace(trust=False)
 TEST, FORCED = (sysid.simulate(TRUTH, LINES, force=force) for force in (False, True))
 
 MODULE = """import numpy as np
@@ -131,7 +132,7 @@ def other_records():
 
 def other_noise():
     """Refine a result whose module gives other records now."""
-    sweeps.check_same_records(answer("nothing"), Recipe("shear_building"))
+    refine.check_same_records(answer("nothing"), Recipe("shear_building"))
 
 
 def begun(strategy="swarm", **given):
@@ -197,23 +198,23 @@ REFUSED = {
         "its own; 'auto' chooses another strategy",
     ),
     "an untrusted module": (
-        lambda: trust.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: requests.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", UNTRUSTED),
         "out/result.h5 names the problem module {here}/idle.py, whose code would run: say --trust where you know what "
         "stands in it, or name the module yourself: --module FILE.py",
     ),
     "a module that is gone": (
-        lambda: trust.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: requests.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", UNTRUSTED),
         "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
         "--module FILE.py",
     ),
     "an edited module": (
-        lambda: unfinished.with_source(begun(source="of another text"), [Path("idle.py")], Path("out")),
+        lambda: requests.with_source(begun(source="of another text"), [Path("idle.py")], Path("out")),
         "out holds an unfinished run of pair.py, strategy swarm, seed 0, and since it began its module or what this "
         "imports from beside itself was edited: give the problem with --out out --fresh to begin anew, or undo the "
         "edit",
     ),
     "a strategy without refinement": (
-        lambda: unfinished.strategy_of(begun("modal", refine_by="leaders")),
+        lambda: requests.strategy_of(begun("modal", refine_by="leaders")),
         "--refine-by is of the strategies 'swarm' and 'hpso-ls', and the strategy is 'modal': leave it out, or give "
         "--strategy swarm or hpso-ls",
     ),

@@ -19,11 +19,11 @@ import sysid
 from benchmarks.hostile.damage import KINDS, damaged
 from benchmarks.line import Line, below
 from sysid.cli.main import main
-from sysid.cli.status import BUG
+from sysid.cli.starting import BUG
 from sysid.files import xsens_dot
 from sysid.jobs.job import Job, JobResult
-from sysid.jobs.ledger import FILE_NAME as LEDGER
-from sysid.jobs.ledger import Ledger
+from sysid.jobs.submission import FILE_NAME as LEDGER
+from sysid.jobs.submission import Ledger
 from sysid.results.checkpoint import Checkpoint
 
 SECONDS, REDUCED = 600.0, 20.0  # a reader

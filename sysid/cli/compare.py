@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.cli import parameters
 from sysid.cli.files import png, results_folder, write_files
 from sysid.cli.output import Output, strict_json
-from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
+from sysid.cli.requests import recipe_of
+from sysid.cli.starting import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.compare import peers, table
 from sysid.compare.comparison import Comparison, compare
 from sysid.compare.method_result import MethodResult
@@ -19,7 +19,7 @@ from sysid.results.version import __version__
 
 def run(options: argparse.Namespace, out: Output) -> int:
     """Compare, tell each method's end in a line, and write table and picture."""
-    recipe = parameters.recipe_of(options, out)
+    recipe = recipe_of(options, out)
     problem = catalogue.build(recipe)
     folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
     out.write(f"{recipe.title}: {problem.n_variables} unknowns, seed {options.seed}\n")

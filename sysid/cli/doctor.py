@@ -9,12 +9,12 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from sysid.cli.output import Output
-from sysid.cli.status import MISTAKE, SUCCESS
+from sysid.cli.starting import MISTAKE, SUCCESS
 from sysid.errors import how_to_install
 from sysid.results.version import __version__
 
@@ -42,25 +42,13 @@ for name in sys.argv[1:]:
 
 @dataclass(frozen=True)
 class Package:
-    """A package that sysid needs, always or for an extra.
-
-    Attributes
-    ----------
-    name, needed : str
-        `needed` is the least version.
-    extra : str
-        "" where it is always needed.
-    version : str
-        "" where it is not installed.
-    enough : bool
-        Whether it is installed, and late enough.
-    """
+    """A package that sysid needs, always or for an extra."""
 
     name: str
-    needed: str
-    extra: str
-    version: str
-    enough: bool
+    needed: str  # the least version
+    extra: str  # "" where it is always needed
+    version: str  # "" where it is not installed
+    enough: bool  # it is installed, and late enough
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
@@ -156,15 +144,3 @@ def _backend() -> str:
     import matplotlib
 
     return str(matplotlib.get_backend())
-
-
-def add(command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the command."""
-    parser = command(
-        "doctor",
-        summary="tell what this installation has, what it lacks, and how to get that",
-        description="Tell versions of Python and packages, the solvers that work here, threads, and which extras are "
-        "installed, with the command for those that are not. Exit status 2 where a search could not work.",
-        examples=("sysid doctor", "sysid doctor --json"),
-    )
-    parser.set_defaults(command=run)

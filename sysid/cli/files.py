@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli.output import Output, strict_json
-from sysid.errors import InputError, shown_plainly
+from sysid.errors import InputError, refuse, shown_plainly
 from sysid.results.checkpoint import Checkpoint
 from sysid.results.identification import Identification
 from sysid.results.lock import FILE_NAME as LOCK
 from sysid.results.lock import alone
 from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
-from sysid.search.deadline import TimeIsOver, within
+from sysid.search.session import TimeIsOver, within
 
 _SUMMARY = "summary.json"
 
@@ -28,16 +28,15 @@ _SUMMARY = "summary.json"
 def results_folder(given: str | None, default: Path) -> Path:
     """The folder of results; one that cannot be written is refused before the search, without making it."""
     folder = default if given is None else Path(given)
-    if given is not None and (not given.strip() or "\0" in given):
-        raise InputError(f"folder of results {given!r}: give the name of a folder")
+    nameless = given is not None and (not given.strip() or "\0" in given)
+    refuse((nameless, f"folder of results {given!r}: give the name of a folder"))
     try:
         place = next((place for place in (folder, *folder.parents) if place.exists()), folder)
-        if not place.is_dir():
-            raise InputError(f"folder of results {folder}: {place} is not a folder")
+        refuse((not place.is_dir(), f"folder of results {folder}: {place} is not a folder"))
     except OSError as error:
         raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"folder of results {folder}: {place} cannot be written")
+    unwritable = not os.access(place, os.W_OK | os.X_OK)
+    refuse((unwritable, f"folder of results {folder}: {place} cannot be written"))
     return folder
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib.machinery
 import keyword
@@ -10,38 +11,36 @@ import re
 import sys
 from pathlib import Path
 
+from sysid.cli.output import Output
+from sysid.cli.starting import SUCCESS
 from sysid.errors import InputError, refuse
 from sysid.files import recorded_test
 from sysid.results.storage import atomically
 
 
-def write_new_problem(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
+def run(options: argparse.Namespace, out: Output) -> int:
+    """Write module and test, and tell what to do with them."""
+    module, test = write_new_problem(options.name, data=options.data)
+    out.wrote(module)
+    out.wrote(test)
+    out.write(
+        f"Try them, then change the steps of {module} into your own:\n"
+        f"  sysid show {module}    what is unknown, and what the data determine\n"
+        f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
+        f"  python -m pytest {test}\n"
+    )
+    return SUCCESS
+
+
+def write_new_problem(name: str, *, data: str | None = None) -> tuple[Path, Path]:
     """Write ``NAME.py`` and ``test_NAME.py``, both whole or neither, and never over what is there.
 
-    Parameters
-    ----------
-    name : str
-        A Python identifier: the test imports the module by it.
-    folder : Path, optional
-        Where to; the current folder by default.
-    data : str, optional
-        A test that ``sysid read`` wrote: the module identifies it, in the place of a simulated one.
-
-    Returns
-    -------
-    tuple of Path
-        The module and its test.
-
-    Raises
-    ------
-    InputError
-        Where the name is no module's name, or one of the two files exists or cannot be written.
+    The test imports the module by its name. The module identifies the test `data`, which ``sysid read`` wrote, or a
+    simulated one.
     """
     _check(name)
-    folder = folder or Path()
-    named = {"NAME": name}
-    texts = [_filled(text, named | words) for text, words in _templates(data)]
-    module, test = folder / f"{name}.py", folder / f"test_{name}.py"
+    texts = [_filled(text, {"NAME": name, **words}) for text, words in _templates(data)]
+    module, test = Path(f"{name}.py"), Path(f"test_{name}.py")
     for path in (module, test):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already, so nothing was written: choose another name, or move it away")

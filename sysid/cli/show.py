@@ -6,6 +6,7 @@ IPOPT counts it in (`sysid.assessment.sensitivity`).
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -15,9 +16,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from sysid import catalogue
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
-from sysid.errors import InputError, SysidError, listed
+from sysid.cli.output import Output
+from sysid.cli.read import tell_channels
+from sysid.cli.requests import is_test, recipe_of
+from sysid.cli.starting import SUCCESS
+from sysid.errors import InputError, SysidError, listed, refuse
+from sysid.files import recorded_test
 from sysid.finding import MOST_OF_A_KIND
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement
@@ -26,6 +33,7 @@ from sysid.nlp import quiet_options
 from sysid.problem.direct_response import Slopes, slopes_of
 from sysid.problem.prepared import HELD, LOOSE, Prepared, points_of
 from sysid.problem.problem import Problem
+from sysid.results.identification import load
 from sysid.results.summary import WIDTH
 from sysid.results.tables import counted, in_columns
 from sysid.search.auto import choose
@@ -35,6 +43,28 @@ from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 _NOISE = 0.01  # of a record's rms, where no noise is stated
 _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequalities
+
+
+def run(options: argparse.Namespace, out: Output) -> int:
+    """Tell of a problem; of a stored result its summary, of a test that ``sysid read`` wrote its channels."""
+    file = options.problem
+    if not is_test(file):
+        recipe = recipe_of(options, out, options.seed)
+        problem = catalogue.build(recipe)
+        if out.json:
+            out.answer(**figures(problem, recipe.title))
+        else:
+            out.write(f"{show(problem, recipe.title)}\n")
+        return SUCCESS
+    of_problems = options.settings or options.data or options.seed is not None
+    refuse((of_problems, f"{file}: --set, --data and --seed are for problems"))
+    if recorded_test.is_recorded_test(file):
+        tell_channels(recorded_test.load(file), out)
+    else:
+        result = load(file)
+        out.write(f"{result.summary()}\n")
+        out.answer(result=result.to_dict())
+    return SUCCESS
 
 
 def show(problem: Problem, name: str) -> str:

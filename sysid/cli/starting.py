@@ -1,6 +1,6 @@
-"""Ctrl-C while Python still imports what the ``sysid`` command needs: one line and status 130, as later on.
+"""Exit statuses, and Ctrl-C while Python still imports what the ``sysid`` command needs: one line, status 130.
 
-It acts from when this module is imported, which is the first thing that the package does.
+The last acts from when this module is imported, which is the first thing that the package does.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from itertools import pairwise
 from pathlib import PurePath
 from typing import NoReturn
 
-from sysid.cli.status import INTERRUPTED
-
+SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130  # as `sysid.cli.main` says
 NOTHING_SAVED = "interrupted; nothing was saved"
 
 

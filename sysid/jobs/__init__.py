@@ -3,10 +3,9 @@
 from sysid.jobs.changes import Band, NumberOfModes, WithoutRun, WithoutSensor
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
-from sysid.jobs.minima import Minimum, distinct
+from sysid.jobs.minima import Minimum, Spread, distinct, spreads
 from sysid.jobs.score import Compared, Move, Score, moves, scored
-from sysid.jobs.spread import Spread, spreads
-from sysid.jobs.submit import submit
+from sysid.jobs.submission import submit
 
 __all__ = [
     "Band",

@@ -1,4 +1,4 @@
-"""Changes of what a job identifies: a band, all runs or sensors but one, some modes, in the place of all of a test."""
+"""Changes of what a job identifies: a band, all runs or sensors but one, some modes, or noise drawn anew."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, as_float, whole_number
+from sysid.errors import InputError, as_float, refuse, whole_number
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness_and_damping import SpectralStiffness
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
+from sysid.problem.stated import StatedProblem
+from sysid.problem.terms import FurtherTest, Prior
 from sysid.results.identification import Identification
+from sysid.structure.structure import Array, ComplexArray, Structure
 
 
 @dataclass(frozen=True)
@@ -161,8 +167,8 @@ class NumberOfModes:
 
     def of(self, problem: Problem) -> Problem:
         """The problem itself, without the goal and the truth, which belong to all modes."""
-        if not problem.declared.free_modes:
-            raise InputError("the number of modes is open only where mass and stiffness are free")
+        held = not problem.declared.free_modes
+        refuse((held, "the number of modes is open only where mass and stiffness are free"))
         return replace(problem, goal=None, reference=None)
 
     def predicted(self, problem: Prepared, result: Identification) -> None:
@@ -174,17 +180,17 @@ Change = Band | WithoutRun | WithoutSensor | NumberOfModes
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     """The problem on another part of its test; a goal and the truth belonged to the whole one."""
-    if not problem.declared.fits_records:
-        raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
+    misfit = not problem.declared.fits_records
+    refuse((misfit, "the problem states a misfit of its own: what part of the records it reads is not known"))
     return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
 
 
 def _all_but(index: int, count: int, what: str) -> NDArray[np.bool_]:
     """Which of so many runs or sensors are left without one, (count,)."""
-    if index >= count:
-        raise InputError(f"there is no {what} {index + 1} ({what}={index}, counted from 0): the test has {count}")
-    if count == 1:
-        raise InputError(f"the test has one {what}; without it nothing is left")
+    refuse(
+        (index >= count, f"there is no {what} {index + 1} ({what}={index}, counted from 0): the test has {count}"),
+        (count == 1, f"the test has one {what}; without it nothing is left"),
+    )
     return np.arange(count) != index
 
 
@@ -194,3 +200,83 @@ def _for_fewer(stiffness: SpectralStiffness, sensors: int) -> SpectralStiffness:
     if given is None or np.size(given) <= sensors:
         return stiffness
     return SpectralStiffness(max_frequency=stiffness.max_frequency)
+
+
+def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> StatedProblem:
+    """The problem with records simulated from the structure of `x` in the place of the measured ones.
+
+    Their noise has the stated standard deviations, raised as the linear uncertainty is where the misfit is larger, else
+    the size of the misfit that `x` leaves; values known to some accuracy are drawn too (parametric bootstrap: B. Efron
+    and R. Tibshirani, An Introduction to the Bootstrap, 1993). With pseudo-values for records, as under Huber's loss,
+    it is the noise under which squares scatter as that loss does: larger than that of the records by 1 / sqrt(0.95)
+    without outliers, and by more with them, and so are the residuals of the draws.
+
+    Raises
+    ------
+    InputError
+        See `check_drawable`.
+    """
+    check_drawable(problem.stated)
+    formulation, rng = problem.formulation, np.random.default_rng(random)
+    tests = iter(formulation.further_tests)
+    priors = iter(formulation.priors)
+    residuals = []
+    for given in problem.stated.residuals:
+        if isinstance(given, FurtherTest):
+            term = next(tests)
+            structure = term.matrices.structure(x, term.test)
+            again = replace(given, measurement=_again(term.test, structure, problem.n_variables, rng))
+        else:
+            _, value, std = given.column("Prior")
+            at = value + std * next(priors).numbers(x)
+            again = replace(given, value=at + std * rng.standard_normal(at.size))
+        residuals.append(again)
+    structure, modal = problem.structure(x), problem.modal[0]
+    if modal.noise is None:
+        test = _again(modal.records, structure, problem.n_variables, rng)
+    else:
+        test = _whole_again(modal, modal.noise, structure, rng)
+    return replace(problem.stated, measurement=test, residuals=residuals, loss="squares", validation=(), reference=None)
+
+
+def check_drawable(problem: StatedProblem) -> None:
+    """Refuse a problem with something fitted whose noise nobody knows: a misfit or residuals of the user's own."""
+    without_noise = [given for given in problem.residuals if not isinstance(given, FurtherTest | Prior)]
+    if without_noise or problem.misfit is not None:
+        raise InputError(
+            "draws of noise need records, and values known to some accuracy (Prior): what noise the misfit or the "
+            "residuals have that this problem states for itself is not known"
+        )
+
+
+def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
+    """The test with the records that the structure makes, and noise of the same size."""
+    inflation = inflation_of(test, noise_records(test, structure, unknowns), unknowns)
+    more = inflation if np.isfinite(inflation) else 1.0
+    response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
+    other = replace(test, response=test.response + response)
+    return other if test.force is None else replace(other, force=test.force + force[0])
+
+
+def _whole_again(
+    modal: ModalEstimate, noise: NoiseLevels, structure: Structure, rng: np.random.Generator
+) -> Measurement:
+    """Whole records that the structure makes with the same transients, and noise of the same levels in all channels."""
+    test, at_rest = modal.given, modal.records
+
+    def drawn(record: ComplexArray, levels: Array) -> ComplexArray:
+        std = np.sqrt(modal.density)[:, None, None] * levels[..., None]
+        return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)
+
+    response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, noise.response)
+    force = None
+    if test.force is not None and at_rest.force is not None and noise.force is not None:
+        force = test.force - (at_rest.force - at_rest.predict_force(structure)) + drawn(test.force, noise.force)
+    return replace(test, base=test.base + drawn(test.base, noise.base), response=response, force=force)
+
+
+def _noise(std: Array, rng: np.random.Generator) -> ComplexArray:
+    """Circular complex noise, ``E|e|² = std²``."""
+    real, imaginary = rng.standard_normal((2, *std.shape))
+    noise: ComplexArray = std * (real + 1j * imaginary) / np.sqrt(2)
+    return noise

@@ -178,13 +178,7 @@ class _OnCluster(Executor):
 
 
 def checked(executor: object) -> Executor:
-    """The executor itself.
-
-    Raises
-    ------
-    InputError
-        Where it is none, or one of threads, which IPOPT does not bear.
-    """
+    """The executor itself; refused where it is none, or one of threads, which IPOPT does not bear."""
     if not isinstance(executor, Executor):
         raise InputError(f"executor is a {type(executor).__name__}: give an Executor, or a function that makes one")
     if isinstance(executor, ThreadPoolExecutor):

@@ -11,8 +11,7 @@ from sysid import catalogue
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
-from sysid.jobs.changes import Change, NumberOfModes
-from sysid.jobs.draws import drawn
+from sysid.jobs.changes import Change, NumberOfModes, drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
@@ -20,7 +19,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
-from sysid.search import robust
+from sysid.search.auto import robust_fit
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
@@ -32,32 +31,15 @@ _BUILT = 4  # problems that a worker keeps
 
 @dataclass(frozen=True)
 class Job:
-    """Description of a job for a worker.
+    """Description of a job for a worker."""
 
-    Attributes
-    ----------
-    index : int
-        Among all jobs that were submitted together.
-    recipe : Recipe
-    start : int
-        0 is the recipe's own start where it has one; all others are fresh points of the search space.
-    source : str
-        Tells what one problem is made from, from another's.
-    draw : int
-        Of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves.
-    strategy : str
-        By which the problem is identified whole; empty for the local phase alone.
-    change : Change or None
-        Of the problem that is identified whole.
-    """
-
-    index: int
+    index: int  # among all jobs that were submitted together
     recipe: Recipe
-    start: int
-    source: str
-    draw: int = 0
-    strategy: str = ""
-    change: Change | None = None
+    start: int  # 0 is the recipe's own where it has one; all others are fresh points of the search space
+    source: str  # tells what one problem is made from, from another's
+    draw: int = 0  # of noise, from 1; the job then starts where the recipe does. 0 fits the records themselves
+    strategy: str = ""  # by which the problem is identified whole; empty for the local phase alone
+    change: Change | None = None  # of the problem that is identified whole
 
     @property
     def seed(self) -> int:
@@ -198,7 +180,7 @@ def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], s
         raise answer.stopped
     structure = problem.structure(answer.x)
     end = Outcome(structure, answer.x, "local phase", answer.success, answer.message, History(), None)
-    end = robust.fit(problem, end, Continuation(), session)
+    end = robust_fit(problem, end, Continuation(), session)
     if end.stopped is not None:
         raise end.stopped
     return end
@@ -214,5 +196,4 @@ def _built(recipe: Recipe, source: str) -> Problem:
 def _widened(recipe: Recipe, source: str) -> list[tuple[TestTerm, ...]]:
     """Its tests with widened peaks, step by step, once a worker."""
     problem = _built(recipe, source).prepared
-    smoother = None if problem.free_modes else smoothed_tests(problem)
-    return [] if smoother is None else smoother.steps
+    return [] if problem.free_modes else smoothed_tests(problem).steps

@@ -1,18 +1,22 @@
-"""Where many starts ended: distinct minima, and how often each was reached."""
+"""Ends of many jobs together: the distinct minima of many starts, and the spread of many draws of noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.assessment.sensitivity import meaningful
+from sysid.errors import InputError
 from sysid.jobs.job import JobResult
 from sysid.problem.prepared import Prepared
+from sysid.results.identification import Identification
+from sysid.results.tables import labelled, quantities
 from sysid.search.continuation import apart
+from sysid.search.other_answers import entries_apart
 from sysid.structure.structure import Structure
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER
+from sysid.structure.thresholds import EXACT, LIKELY, NEGLIGIBLE, SAME_ANSWER
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +66,63 @@ def distinct(problem: Prepared, results: Iterable[JobResult]) -> list[Minimum]:
 
 def _matrices_apart(one: Structure, other: Structure) -> float:
     """Largest difference of entries of M, K and C, each over the root of the two diagonal entries."""
-    most = 0.0
-    for name in ("mass", "stiffness", "damping"):
-        a, b = getattr(one, name), getattr(other, name)
-        size = np.sqrt(np.maximum(np.abs(np.diag(a)), np.abs(np.diag(b))))
-        size[size == 0] = size.max() or 1.0  # a base without mass
-        most = max(most, float(np.max(np.abs(a - b) / np.outer(size, size))))
-    return most
+    pairs = ((one.mass, other.mass), (one.stiffness, other.stiffness), (one.damping, other.damping))
+    return max(entries_apart(a, b, np.maximum(np.abs(np.diag(a)), np.abs(np.diag(b)))) for a, b in pairs)
 
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:
     """Minima that fit as well as the best one, it included."""
     most = max((1 + SAME_ANSWER) * minima[0].residual, EXACT) if minima else np.nan
     return [minimum for minimum in minima if minimum.residual <= most]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A quantity in many draws beside its linear uncertainty.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        As identified.
+    std : float
+        Standard deviation to first order; NaN where it is not known.
+    drawn : float
+        Standard deviation of the draws about `value`.
+    inside : float
+        Share of the draws within 1.96 of `std` about `value`: 0.95 where the linear interval is right.
+    """
+
+    name: str
+    value: float
+    std: float
+    drawn: float
+    inside: float
+
+    @property
+    def ratio(self) -> float:
+        """Of both standard deviations, 1 where the linear one is right; NaN where it is not known."""
+        return self.drawn / self.std if self.std > 0 else np.nan
+
+
+def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
+    """Frequencies, damping ratios and unknowns of a result in the draws that succeeded.
+
+    Raises
+    ------
+    InputError
+        Where fewer than two draws did.
+    """
+    found = [end for end in ends if end.success]
+    if len(found) < 2:
+        raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
+    u = result.uncertainty
+    stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
+    structures = [result.problem.structure(end.x) for end in found]
+    draws = [quantities(replace(result, x=end.x, structure=s)) for end, s in zip(found, structures, strict=True)]
+    rows = []
+    for name, value in quantities(result).items():
+        off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
+        inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
+        rows.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
+    return rows

@@ -7,7 +7,7 @@ notebook shows the one that a cell ends with. ``sysid.plot.mac(result).savefig("
 Measured is thin and dark, identified dashed and coloured above it, their difference faint.
 """
 
-from sysid.plot.comparison import comparison
+from sysid.plot.comparison import comparison, minima
 from sysid.plot.plots import (
     base_force,
     base_forces,
@@ -22,7 +22,6 @@ from sysid.plot.plots import (
     stabilisation,
     transmissibility,
 )
-from sysid.plot.refinement import minima
 
 __all__ = [
     "base_force",

@@ -1,4 +1,4 @@
-"""Measured against identified spectra: magnitude above phase, a panel a channel."""
+"""Panels: measured against identified spectra, the stabilisation diagram, the complex mode indicator function."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import (
     FAINT,
@@ -29,6 +29,16 @@ from sysid.structure.thresholds import LIKELY, ROUND_OFF
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
+
+from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
+from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.plot.canvas import COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
 
 _BAND: dict[str, Any] = {
     "color": IDENTIFIED["color"], "alpha": 0.25, "linewidth": 0, "label": "95 % band", "zorder": 1.5,
@@ -70,7 +80,7 @@ def response_channel(
     predicted = test.predict(identification.structure)[run, sensor] + test.rigid_body[sensor] @ test.base[run]
     unit = "–" if test.translational[run % test.n_base] else "m"
     words = test.sensor_names[sensor], f"transmissibility [{unit}]", "acceleration spectrum\n[m/s², own scale]"
-    std = _std(test, run, _band_of(test, band, test.n_sensors)[sensor])
+    std = _std(test, run, band, test.n_sensors, sensor)
     drawn = _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
     return drawn._replace(outliers=_outliers(identification, test, test.sensor_names[sensor], run))
 
@@ -89,7 +99,7 @@ def force_channel(
         f"apparent mass [{per_base}]",
         f"force spectrum\n[{unit}, own scale]",
     )
-    std = _std(test, run, _band_of(test, band, test.n_base)[direction])
+    std = _std(test, run, band, test.n_base, direction)
     largest = np.abs(test.force[:, direction]).max()
     drawn = _channel(test, test.force[run, direction], predicted, run, words, largest, std)
     return drawn._replace(outliers=_outliers(identification, test, f"force {test.base_axes[direction]}", run))
@@ -101,17 +111,12 @@ def _outliers(identification: Identification, test: Measurement, channel: str, r
     return np.array([one.freq for one in found if one[:3] == (1, run + 1, channel)])
 
 
-def _band_of(test: Measurement, band: ArrayLike | None, rows: int) -> Array:
-    """Check standard deviations of a test's spectra, (rows, d, n_freq); zeros where there are none."""
+def _std(test: Measurement, run: int, given: ArrayLike | None, rows: int, row: int) -> Array:
+    """Of a spectrum in one run, those of the answers to each direction alone `given`, (rows, d, n_freq), or zeros."""
     shape = (rows, test.n_base, test.freq.size)
-    std = np.zeros(shape) if band is None else np.asarray(band, float)
-    if std.shape != shape:
-        raise InputError(f"band has shape {std.shape}; standard deviations at the test's lines are {shape}")
-    return std
-
-
-def _std(test: Measurement, run: int, band: Array) -> Array:
-    """Of a spectrum in one run, `band` (d, n_freq) being that of the answer to each direction alone."""
+    std = np.zeros(shape) if given is None else np.asarray(given, float)
+    refuse((std.shape != shape, f"band has shape {std.shape}; standard deviations at the test's lines are {shape}"))
+    band = std[row]
     # Errors of different directions may add up whatever their phases: the sum is never too small.
     return np.sum(band * np.abs(test.base[run]), axis=0)
 
@@ -122,21 +127,17 @@ def _channel(
 ) -> PlottedChannel:  # fmt: skip
     """A channel of which `words` name the record, what it is for unit runs, and what it is for others."""
     name, per_base, spectrum = words
-    title = f"{name}, {run_names(test)[run]}"
+    title, at, gaps = f"{name}, {run_names(test)[run]}", np.ones(test.freq.size, bool), test.gaps
     negligible = bool(np.abs(measured).max() <= ROUND_OFF * largest)
-    if test.has_unit_runs:
-        ones = np.ones_like(measured)
-        return PlottedChannel(
-            test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0), test.gaps
-        )
-    moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
-    assert test.base_axes is not None
-    phase = f"phase to\nbase {test.base_axes[moved]} [°]"
-    # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
-    against = test.base[run, moved]
-    at, gaps = lines_of(test, run)
+    against, quantity, phase = np.ones_like(measured), per_base, "phase [°]"
+    if not test.has_unit_runs:
+        moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
+        assert test.base_axes is not None
+        # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
+        against, quantity, phase = test.base[run, moved], spectrum, f"phase to\nbase {test.base_axes[moved]} [°]"
+        at, gaps = lines_of(test, run)
     return PlottedChannel(
-        test.freq[at], measured[at], predicted[at], against[at], title, spectrum, phase, negligible, std[at],
+        test.freq[at], measured[at], predicted[at], against[at], title, quantity, phase, negligible, std[at],
         np.zeros(0), gaps,
     )  # fmt: skip
 
@@ -258,11 +259,10 @@ def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array
 def named_index(what: str, value: int | str, names: Sequence[str]) -> int:
     """Index of a name or of a number, which may count from the end; `what` it is, for the message of an InputError."""
     if isinstance(value, str):
-        if value not in names:
-            raise InputError(f"{what} {value!r} is unknown; there are {', '.join(names)}")
+        refuse((value not in names, f"{what} {value!r} is unknown; there are {', '.join(names)}"))
         return list(names).index(value)
-    if not -len(names) <= value < len(names):
-        raise InputError(f"{what} {value} is out of range: there are {len(names)}, counted from 0")
+    outside = not -len(names) <= value < len(names)
+    refuse((outside, f"{what} {value} is out of range: there are {len(names)}, counted from 0"))
     return int(value) % len(names)
 
 
@@ -291,6 +291,126 @@ def strongest(
 
 def with_force(test: Measurement) -> Measurement:
     """The measurement itself; an InputError where it has no base force."""
-    if test.force is None:
-        raise InputError("base_force: this measurement has no base force")
+    refuse((test.force is None, "base_force: this measurement has no base force"))
     return test
+
+
+# New poles stay in the background; what is stable in everything stands out.
+_MARKS: tuple[dict[str, Any], ...] = (
+    {"marker": ".", "color": "#c3cad2", "markersize": 4},
+    {"marker": "x", "color": COLOURS[4], "markersize": 4, "markeredgewidth": 0.9},
+    {"marker": "s", "color": COLOURS[1], "markersize": 3.2, "markerfacecolor": "none"},
+    {"marker": "o", "color": COLOURS[2], "markersize": 3.8},
+)
+
+
+_ORDINALS = ("second", "third", "fourth", "fifth", "sixth")
+_CURVES: tuple[dict[str, Any], ...] = (
+    {"color": MEASURED["color"], "linewidth": 1.2, "label": "first"},
+    *({"color": colour, "linewidth": 1.0, "label": name} for colour, name in zip(COLOURS, _ORDINALS, strict=False)),
+)
+
+
+def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
+    """Poles of every order over the largest singular value of the FRFs; found modes as vertical lines."""
+    from matplotlib.ticker import MaxNLocator
+
+    test, modes, label = _modes_of(subject)
+    values, _, unit = _indicator(test)
+    behind: Any = ax.twinx()
+    behind.plot(broken(test.freq, test.gaps), broken(positive(values[0]), test.gaps), color=FAINT, linewidth=0.8)
+    ax.set_zorder(behind.get_zorder() + 1)
+    ax.patch.set_visible(False)
+    frequency_axis(ax, test.freq)
+    _mode_lines(ax, modes, label)
+    words, quantity = "", "order [modes]"
+    try:
+        diagram = stabilisation(test)
+    except InputError as error:
+        words, quantity = f"No poles are shown: {error}.", ""
+        _remark(ax, words)
+        ax.set_yticks([])
+    else:
+        for level, style in enumerate(_MARKS):
+            of_level = diagram.stable == level
+            at = diagram.frequency[of_level], diagram.order[of_level]
+            name = f"stable: {LEVELS[level]}" if level else "new pole"
+            ax.plot(*at, linestyle="none", zorder=2 + 0.1 * level, label=name, **style)
+        ax.set_ylim(0, 1.04 * diagram.order.max(initial=2))
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    dress(ax, "Stabilisation diagram", "frequency [Hz]", quantity)
+    _log_magnitude(behind, values[0], room=bool(words))
+    dress(behind, "", "", f"largest singular value{unit}", grid=False)
+    for name, spine in behind.spines.items():
+        spine.set_visible(name == "right")
+    # What is surest is told first.
+    _legend_below(ax, list(reversed(ax.get_lines())), 3)
+
+
+def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
+    """All singular values of the FRFs at each line; found modes as vertical lines."""
+    test, modes, label = _modes_of(subject)
+    values, reason, unit = _indicator(test)
+    for curve, style in zip(values, _CURVES, strict=False):
+        ax.plot(broken(test.freq, test.gaps), broken(positive(curve), test.gaps), zorder=3, **style)
+    frequency_axis(ax, test.freq)
+    _mode_lines(ax, modes, label)
+    _log_magnitude(ax, values, room=bool(reason))
+    if reason:
+        _remark(ax, f"Singular values of the runs' own spectra: {reason}.")
+    dress(ax, "Complex mode indicator function", "frequency [Hz]", f"singular value{unit}")
+    _legend_below(ax, ax.get_lines(), 4)
+
+
+def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:
+    """Test, the modes to compare with (Hz), and whose they are: the result's, else those that vector fitting finds."""
+    if isinstance(subject, Identification):
+        return subject.fitted.records, subject.structure.natural_frequencies, "identified mode"
+    try:
+        return subject, find_poles(subject).omega / (2 * np.pi), "vector fitting"
+    except InputError:
+        return subject, np.zeros(0), ""
+
+
+def _indicator(test: Measurement) -> tuple[Array, str, str]:
+    """Singular values of the FRFs or, with the reason, where there are none of the runs' spectra; and their unit."""
+    try:
+        turns = not np.all(test.translational)
+        return singular_values(relative_frf(test)), "", " [–; m for rotations]" if turns else " [–]"
+    except InputError as error:
+        return singular_values(np.moveaxis(test.relative, 0, 1)), str(error), "\n[m/s², own scale]"
+
+
+def _log_magnitude(ax: Axes, values: Array, *, room: bool) -> None:
+    """Logarithmic axis over seven decades at most (what lies below is arithmetic), with room for a remark on top."""
+    from matplotlib.ticker import NullLocator
+
+    if np.any(values > 0):
+        top = float(values.max())
+        ax.set_yscale("log")
+        ax.yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
+        ax.set_ylim(max(0.5 * float(values[values > 0].min()), 1e-7 * top), (20 if room else 2) * top)
+
+
+def _remark(ax: Axes, words: str) -> None:
+    import textwrap
+
+    ax.text(
+        0.02, 0.97, textwrap.fill(words, 72), transform=ax.transAxes, va="top", fontsize=8, color=INK,
+        parse_math=False, zorder=5, bbox={"facecolor": "white", "edgecolor": "none"},
+    )  # fmt: skip
+
+
+def _mode_lines(ax: Axes, modes: Array, label: str) -> None:
+    low, high = ax.get_xlim()
+    in_band = modes[(modes >= low) & (modes <= high)]
+    for mode, name in zip(in_band, [label, *["_"] * in_band.size], strict=False):
+        ax.axvline(mode, **{**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5, "label": name})
+
+
+def _legend_below(ax: Axes, lines: Sequence[Line2D], columns: int) -> None:
+    handles = [line for line in lines if not str(line.get_label()).startswith("_")]
+    ax.legend(
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.6, ncols=columns,
+        frameon=False, fontsize="small", columnspacing=1.4, handlelength=1.6,
+    )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import HUBER
 from sysid.plot.canvas import (
@@ -27,9 +27,10 @@ from sysid.plot.canvas import (
     plain_log,
     positive,
 )  # fmt: skip
-from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
 from sysid.plot.panels import (
     draw,
+    draw_cmif,
+    draw_stabilisation,
     force_channel,
     key,
     named_index,
@@ -317,8 +318,8 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
     structure = identification.structure
     columns = 6
     chosen = range(1, min(structure.n, columns) + 1) if modes is None else modes
-    if any(not 1 <= k <= structure.n for k in chosen):
-        raise InputError(f"modes {list(chosen)}: this structure has modes 1 to {structure.n}")
+    unknown = any(not 1 <= k <= structure.n for k in chosen)
+    refuse((unknown, f"modes {list(chosen)}: this structure has modes 1 to {structure.n}"))
     columns = min(len(chosen), columns)
     rows = -(-len(chosen) // columns)
     figure = new_figure(max(1.9 * columns, 3.0), 2.7 * rows)
@@ -454,8 +455,7 @@ def stick_model(
     if sensors is None:
         raise InputError("mode_shapes: the sensors are not described; give the measurement sysid.Sensor objects")
     points, owner = np.unique(np.array([s.position for s in sensors], float).round(9), axis=0, return_inverse=True)
-    if len(points) < 2:
-        raise InputError("mode_shapes: all sensors are described at one place; positions are needed")
+    refuse((len(points) < 2, "mode_shapes: all sensors are described at one place; positions are needed"))
     motion = np.zeros((len(points), 3, len(sensors)))
     for s, (sensor, p) in enumerate(zip(sensors, np.ravel(owner), strict=True)):
         motion[p, :, s] = axis_vector(sensor.axis)

@@ -22,9 +22,9 @@ from sysid.results.identification import Recipe
 from sysid.results.lock import alone
 from sysid.results.storage import atomically, unfinished_writings
 from sysid.results.version import __version__
-from sysid.search.journal import EVERY, Journal
-from sysid.search.refinement import RefineBy
+from sysid.search.session import EVERY, Journal
 from sysid.search.strategy import Strategy
+from sysid.search.swarm_objective import RefineBy
 from sysid.structure.structure import Structure
 
 FILE_NAME = "unfinished.h5"

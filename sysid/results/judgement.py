@@ -18,9 +18,8 @@ from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, we
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
-from sysid.search.deadline import TimeIsOver, within
 from sysid.search.other_answers import with_other_answers
-from sysid.search.session import Session
+from sysid.search.session import Session, TimeIsOver, within
 from sysid.search.strategy import Outcome
 from sysid.structure.thresholds import EXACT
 

@@ -16,10 +16,9 @@ from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.deadline import TimeIsOver, within
 from sysid.search.modal import objective_of
-from sysid.search.modal_scaling import to_stated_totals
-from sysid.search.session import Session
+from sysid.search.modal_program import to_stated_totals
+from sysid.search.session import Session, TimeIsOver, within
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY

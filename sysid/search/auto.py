@@ -1,21 +1,29 @@
-"""The strategies by their names, and "auto": the first that applies, and those after it while there is no good fit."""
+"""The strategies by their names, "auto", and the rounds of Huber's loss after any of them.
+
+"auto" takes the first strategy that applies, and those after it while there is no good fit. Huber's loss is least
+squares of pseudo-values, again and again from the last answer, until it stays.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
+from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
 from sysid.search.continuation import Continuation
-from sysid.search.modal import Modal
+from sysid.search.local import solve
+from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session
-from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Outcome, Strategy
+from sysid.search.strategy import DoesNotApplyError, History, NoStrategyError, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
-from sysid.structure.structure import Structure
+from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
 STRATEGIES: tuple[type[Modal] | type[Continuation] | type[Swarm], ...] = (Modal, Continuation, Swarm)  # as "auto" goes
 NAMED: dict[str, Callable[[], Strategy]] = {
@@ -29,10 +37,12 @@ Start = ArrayLike | Structure | None
 
 def check_strategy(strategy: str | Strategy) -> None:
     """Refuse what is no strategy, before anything is looked for."""
-    if not isinstance(strategy, str | Modal | Continuation | Swarm):
-        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings")
-    if isinstance(strategy, str) and strategy not in ("auto", *NAMED):
-        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
+    known, named = isinstance(strategy, Modal | Continuation | Swarm), isinstance(strategy, str)
+    other = f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings"
+    refuse(
+        (not (known or named), other),
+        (named and strategy not in ("auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
+    )
 
 
 def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[Strategy, str]:
@@ -52,27 +62,18 @@ def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[S
     raise InputError(f"no strategy applies: {'; '.join(refusals)}")
 
 
+@dataclass(frozen=True)
 class InTurn:
-    """A strategy, and under "auto" those after it while there is no good fit.
+    """A strategy, and under "auto", where others may `follow`, those after it while there is no good fit.
 
-    Parameters
-    ----------
-    problem : Prepared
-        In squares.
-    session : Session
-    start : array_like, Structure or None
-    mistakes : callable
-        Of the problem and a poor outcome the mistakes that explain it, so that no other strategy would do better.
-    follow : bool
-        Whether others may follow.
+    `mistakes` are those that explain a poor outcome, so that no other strategy would do better.
     """
 
-    def __init__(
-        self, problem: Prepared, session: Session, start: Start,
-        mistakes: Callable[[Prepared, Outcome], tuple[Finding, ...]], *, follow: bool,
-    ) -> None:  # fmt: skip
-        self.problem, self.session, self.start = problem, session, start
-        self.mistakes, self.follow = mistakes, follow
+    problem: Prepared  # in squares
+    session: Session
+    start: Start
+    mistakes: Callable[[Prepared, Outcome], tuple[Finding, ...]]
+    follow: bool
 
     def run(self, chosen: Strategy, why: str) -> tuple[Outcome, str]:
         """Where the best ended, and why it was taken."""
@@ -124,3 +125,125 @@ class InTurn:
         if second.stopped is None:
             return first
         return replace(first, success=False, message=str(second.stopped) or "interrupted", stopped=second.stopped)
+
+
+_SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
+
+
+def robust_fit(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
+    """Where Huber's loss is least, in so many rounds at most, from the answer to the screened records.
+
+    The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns. `end` is
+    of a search in ``problem.screened``, and `strategy` has its settings, as far as it was its own.
+    """
+    if problem.in_squares or end.stopped is not None:
+        return end
+    if problem.stopped:
+        return end.with_note("Huber's loss was not fitted, as the search for modes was stopped: squares were")
+    moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
+    for number in range(1, rounds + 1):
+        try:
+            again = _fitted(fitted, end, strategy, session)
+            if again.stopped is not None:
+                raise again.stopped
+            if end.strategy != Modal.name:
+                again = _farther(problem, end, again)
+            fitted = problem.pseudo_values(again.structure, again.x)
+        except (Stop, KeyboardInterrupt) as stop:
+            return _cut_short(end, str(stop) or "interrupted", stop)
+        except (InputError, SolverError) as error:
+            return _cut_short(end, f"round {number} of Huber's loss came to nothing: {error}")
+        moved = _moved(fitted, end, again)
+        session.log(f"round {number} of Huber's loss: {again.message}; the unknowns move by {moved:.2g} deviations")
+        end = _with_round(problem.screened, end, again, session)
+        if moved < _SETTLED:
+            return end.with_note(f"Huber's loss settled after {number} rounds")
+        if session.is_over:
+            break
+    sentence = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
+    return end.with_note(sentence) if moved < _NEAR else _cut_short(end, sentence)
+
+
+def check_local_phase(problem: Prepared, strategy: Strategy) -> None:
+    """Refuse a swarm without its local phase, which would leave nothing to go on from."""
+    if problem.stated.loss == "huber" and isinstance(strategy, Swarm) and strategy.local is None:
+        raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
+
+
+def _with_round(problem: Prepared, end: Outcome, again: Outcome, session: Session) -> Outcome:
+    """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
+    left = objective_of(problem, again.structure, again.x)
+    curve = np.concatenate([end.history.local_curve, again.history.local_curve])
+    phases = [phase for phase in end.history.phases if phase.name != HUBER]
+    before = sum(phase.evaluations for phase in end.history.phases if phase.name == HUBER)
+    x = np.zeros(0) if again.x is None else again.x
+    phases.append(Phase(HUBER, left, x, session.seconds, before + again.history.local_curve.size))
+    history = replace(end.history, local=left, local_curve=curve, phases=tuple(phases))
+    return replace(again, findings=end.findings, history=history)
+
+
+def _cut_short(end: Outcome, why: str, stopped: BaseException | None = None) -> Outcome:
+    return replace(end, success=False, message=f"{end.message}; {why}", stopped=stopped)
+
+
+def _fitted(problem: Prepared, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+    """The answer to pseudo-values, from the last one."""
+    if end.strategy == Modal.name:
+        return (strategy if isinstance(strategy, Modal) else Modal()).run(problem, session, None)
+    assert end.x is not None
+    coordinates = (strategy.local if isinstance(strategy, Swarm) else None) or "modal"
+    answer = solve(
+        problem, end.x, max_time=session.left, monitor=session.reporter("local phase"), coordinates=coordinates
+    )
+    return replace(
+        end, structure=problem.structure(answer.x), x=answer.x, success=answer.success, message=answer.message,
+        history=History(local_curve=answer.curve), stopped=answer.stopped,
+    )  # fmt: skip
+
+
+def _farther(problem: Prepared, before: Outcome, after: Outcome) -> Outcome:
+    """The answer, or one farther along its step, as far as the loss falls while steps double.
+
+    Where most of what tells an unknown is still far off, each number pulls as little as an outlier.
+    """
+    assert before.x is not None and after.x is not None
+    fits = problem.fits(after.structure, after.x)
+    predictions = [(modal.records, predicted(modal.records, its)) for modal, its in fits]
+    stds = [part.std for test, values in predictions for part in whitened(test, values, problem.n_variables)]
+
+    def left(x: Array, structure: Structure) -> float:
+        found = 0.0
+        units = iter(stds)
+        for modal, its in problem.fits(structure, x):
+            test = modal.records
+            records = [record for record in (test.relative, test.force) if record is not None]
+            found += sum(loss((y - f) / next(units)) for y, f in zip(records, predicted(test, its), strict=True))
+        return found
+
+    best, step, times = left(after.x, after.structure), after.x - before.x, 2.0
+    while times <= 64.0:  # steps that are doubled
+        x = np.clip(before.x + times * step, np.minimum(problem.lower, after.x), np.maximum(problem.upper, after.x))
+        try:
+            structure = problem.structure(x)
+        except InputError:
+            break
+        value = left(x, structure)
+        if not value < best:
+            break
+        after, best, times = replace(after, x=x, structure=structure), value, 2 * times
+    return after
+
+
+def _moved(problem: Prepared, before: Outcome, after: Outcome) -> float:
+    """Distance of two answers by what they make of the records, in standard deviations of an unknown; 0 where exact."""
+    squares = change = size = 0.0
+    fits = zip(problem.fits(before.structure, before.x), problem.fits(after.structure, after.x), strict=True)
+    for (modal, one), (_, other) in fits:
+        test = modal.records
+        # Pseudo-values state the noise as it counts.
+        stds = [std for std in (test.response_std, test.force_std) if std is not None]
+        for a, b, std in zip(predicted(test, one), predicted(test, other), stds, strict=True):
+            squares += 2 * float(np.sum(np.abs((a - b) / std) ** 2))
+            change += float(np.sum(np.abs(a - b) ** 2))
+            size += float(np.sum(np.abs(b) ** 2))
+    return 0.0 if change <= ROUND_OFF**2 * size else float(np.sqrt(squares / problem.n_variables))

@@ -68,14 +68,12 @@ class Continuation:
         return _Run(problem, session).outcome(self.starts, start)
 
 
-def smoothed_tests(problem: Prepared, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
-    """Fitted tests at complex frequencies; None where one shows no poles, or none is fitted."""
-    if not problem.formulation.fits_records:
-        return None
-    terms = problem.formulation.tests
+def smoothed_tests(problem: Prepared, monitor: Callable[[int, float], object] | None = None) -> _Smoother:
+    """Fitted tests at complex frequencies; none where one shows no poles, or none is fitted."""
+    terms = problem.formulation.tests if problem.formulation.fits_records else ()
     found = [PolesAndResidues.of(term.test, monitor=monitor) for term in terms]
     known = [poles for poles in found if poles is not None]
-    return _Smoother(terms, known) if len(known) == len(terms) else None
+    return _Smoother(terms, known) if len(known) == len(terms) else _Smoother((), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,8 @@ class _Smoother:
     @property
     def steps(self) -> list[tuple[TestTerm, ...]]:
         """The tests with smaller and smaller shifts."""
-        return [tuple(self._at(term, poles, share) for term, poles in self._pairs) for share in SHIFTS]
+        shares = SHIFTS if self.terms else ()
+        return [tuple(self._at(term, poles, share) for term, poles in self._pairs) for share in shares]
 
     @property
     def floor(self) -> float:
@@ -152,7 +151,7 @@ class _Run:
     def __init__(self, problem: Prepared, session: Session) -> None:
         self.problem, self.session = problem, session
         self.smoother = smoothed_tests(problem, session.preparing)
-        self.steps = [] if self.smoother is None else self.smoother.steps
+        self.steps = self.smoother.steps
         self.ends: list[tuple[float, LocalResult]] = []
         self.ways: list[Array] = []
         self.joined = 0  # starts whose way another one has come before
@@ -163,9 +162,7 @@ class _Run:
     def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
         """Search, and take the best end."""
         problem, session = self.problem, self.session
-        floor = (
-            "" if self.smoother is None else f"; free residues at the poles of the data leave {self.smoother.floor:.3g}"
-        )
+        floor = f"; free residues at the poles of the data leave {self.smoother.floor:.3g}" * bool(self.steps)
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         left_out = 0
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
@@ -233,7 +230,7 @@ class _Run:
         problem = self.problem
         if problem.stated.goal is not None:
             return problem.residual(best.x) <= problem.stated.goal
-        if self.smoother is None:
+        if not self.steps:
             return best.success
         # What residuals of the user's own leave beside the tests has no floor of its own.
         of_terms = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
@@ -268,15 +265,15 @@ def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence)
     if count < 1:
         return []
     points = spread_points(problem.formulation, DRAWN * count, np.random.default_rng(random))
-    return list(islice((x for x in points if _is_structure(problem, x)), count))
+    return list(islice((x for x in points if structure_of(problem, x) is not None), count))
 
 
-def _is_structure(problem: Prepared, x: Array) -> bool:
+def structure_of(problem: Prepared, x: Array) -> Structure | None:
+    """The structure that unknowns stand for; None where they stand for none."""
     try:
-        problem.structure(x)
+        return problem.structure(x)
     except InputError:
-        return False
-    return True
+        return None
 
 
 def _objective_at(problem: Prepared, x: Array) -> float:

@@ -27,10 +27,10 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.expressions import lower_triangle, triangle_entries
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, product, time_too_short
+from sysid.nlp import IterationMonitor, NonlinearProgram, product, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
-from sysid.search.modal_scaling import stated_totals
+from sysid.search.modal_program import stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 
@@ -65,24 +65,12 @@ def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor
 
 
 class Coordinates(NamedTuple):
-    """A structure in the coordinates of this phase.
+    """A structure in the coordinates of this phase."""
 
-    Attributes
-    ----------
-    inverse : (n, n)
-        R, lower triangular; ``M_SS = (R'R)^-1``, kg^-½.
-    loads : (n, d)
-        P, kg^½ (times m for a rotation).
-    base : (d, d)
-        N, lower triangular.
-    psi : (n, n)
-        Eigenvectors of H, orthogonal.
-    """
-
-    inverse: Array
-    loads: Array
-    base: Array
-    psi: Array
+    inverse: Array  # R, (n, n), lower triangular; M_SS = (R'R)^-1, kg^-½
+    loads: Array  # P, (n, d), kg^½ (times m for a rotation)
+    base: Array  # N, (d, d), lower triangular
+    psi: Array  # eigenvectors of H, (n, n), orthogonal
 
 
 def coordinates_of(structure: Structure) -> Coordinates:
@@ -104,11 +92,6 @@ class InverseFactorError:
 
     The coordinates are one column: the entries of R, row by row, P by columns, the entries of N, row by row, where a
     base force was measured, the entries below the diagonal of the skew-symmetric S, log w (n,) and log zeta (n,).
-
-    Parameters
-    ----------
-    problem : Prepared
-        With free modes.
 
     Attributes
     ----------
@@ -249,24 +232,12 @@ def _scaled(z: NonlinearProgram, name: str, start: Array, size: float) -> ca.MX:
 
 def _derivatives(z: NonlinearProgram, y: ca.MX, error: InverseFactorError, psi_0: Array) -> dict[str, ca.Function]:
     """Gradient and exact Hessian by the program's unknowns, in IPOPT's scale of the objective."""
-    at, rows = z.z, ca.vertcat(ca.MX(0, 1), *z.constraints)
+    at = z.z
     value, slope = error.gradient(y, psi_0)
     chain, pull = ca.jacobian(y, at), ca.MX.sym("pull", y.numel())
     bend = ca.Function("bend", [at, pull], [ca.hessian(ca.dot(pull, y), at)[0]])
-    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
-    hessian = OBJECTIVE_SCALE * factor * (chain.T @ error.hessian(y, psi_0) @ chain + bend(at, slope))
-    if rows.numel():
-        hessian += ca.hessian(ca.dot(multipliers, rows), at)[0]
-    return {
-        "grad_f": ca.Function(
-            "gradient", [at, p], [OBJECTIVE_SCALE * value, OBJECTIVE_SCALE * (chain.T @ slope)],
-            ["x", "p"], ["f", "grad_f_x"],
-        ),
-        "hess_lag": ca.Function(
-            "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
-            ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
-        ),
-    }  # fmt: skip
+    hessian = chain.T @ error.hessian(y, psi_0) @ chain + bend(at, slope)
+    return {"grad_f": z.gradient(value, chain.T @ slope), "hess_lag": z.hessian(hessian)}
 
 
 def _left_in_words(problem: Prepared, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> str:
@@ -285,10 +256,9 @@ def half_newton_decrement(z: NonlinearProgram, derivatives: dict[str, ca.Functio
     Equalities are kept and unknowns on a bound held. Where the objective is not convex, the sizes of its curvatures
     count; directions along which it is flat gain nothing.
     """
-    rows = ca.vertcat(ca.MX(0, 1), *z.constraints)
     value, gradient = (np.asarray(part) for part in derivatives["grad_f"](at, []))
-    A = np.asarray(ca.Function("slopes", [z.z], [ca.densify(ca.jacobian(rows, z.z))])(at)).reshape(-1, at.size)
-    g, lower, upper = gradient.ravel(), np.concatenate(z.lower), np.concatenate(z.upper)
+    A = np.asarray(ca.Function("slopes", [z.z], [ca.densify(ca.jacobian(z.rows, z.z))])(at)).reshape(-1, at.size)
+    g, (lower, upper) = gradient.ravel(), z.bounds
     near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
     free = ~(((at - lower < near) & (g > 0)) | ((upper - at < near) & (g < 0)))
     g, A = g[free], A[:, free]

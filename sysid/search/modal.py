@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, SolverError, Stop, sequence, whole_number
+from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
@@ -33,8 +33,15 @@ from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
-from sysid.search.modal_program import Spectrum, Ties, solve_modes
-from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.modal_program import (
+    Spectrum,
+    Ties,
+    nearest_lumped,
+    of_known_mass,
+    solve_modes,
+    stated_totals,
+    to_stated_totals,
+)
 from sysid.search.session import Session
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
@@ -78,18 +85,16 @@ class Modal:
 
     def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why poles and residues do not make the matrices, or a start that it would not read."""
-        formulation = problem.formulation
-        if not formulation.test_alone or formulation.healed or not formulation.geometry.at_sensors:
-            return "the problem is written in unknowns of its own"
-        described = formulation.mass.free or formulation.mass.entries is not None
-        if not formulation.stiffness.free:
-            form = formulation.parts.stiffness.stop > formulation.parts.stiffness.start
-            return "the stiffness has a form of its own" if form else "the problem is written in unknowns of its own"
-        if not described:
-            return "the problem is written in unknowns of its own"
-        if not formulation.damping.free:
-            return "the damping has a form of its own"
-        return None if start is None else "a start was given"
+        formulation, written = problem.formulation, "the problem is written in unknowns of its own"
+        part, mass = formulation.parts.stiffness, formulation.mass
+        reasons = (
+            (not formulation.test_alone or formulation.healed or not formulation.geometry.at_sensors, written),
+            (not formulation.stiffness.free and part.stop > part.start, "the stiffness has a form of its own"),
+            (not formulation.stiffness.free or not (mass.free or mass.entries is not None), written),
+            (not formulation.damping.free, "the damping has a form of its own"),
+            (start is not None, "a start was given"),
+        )
+        return next((why for applies, why in reasons if applies), None)
 
     def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Modes from the data, and the structure that they make; a start is not read."""
@@ -104,18 +109,17 @@ class Modal:
 
 @dataclass(frozen=True, eq=False)
 class DegreesOfFreedom:
-    """Degrees of freedom of a modal model.
-
-    Attributes
-    ----------
-    sensors : (k,) of int
-        The physical ones: sensors, ascending.
-    modes : (m - k,) of int
-        Modal coordinates beside them, modes counted from 0.
-    """
+    """Degrees of freedom of a modal model: sensors (k,), ascending, and modal coordinates (m - k,) beside them."""
 
     sensors: Integers
     modes: Integers
+
+    def coordinates(self, problem: Prepared, phi: Array) -> tuple[Array, Array, Array]:
+        """Inverse of the mode shapes at them, (m, m), their rigid motion, (m, d), and base direction, (m,), or -1."""
+        geometry, k = problem.geometry, self.modes.size
+        shapes = np.vstack([phi[self.sensors], np.eye(phi.shape[1])[self.modes]])
+        G = np.vstack([geometry.rigid_body[self.sensors], np.zeros((k, geometry.d))])
+        return np.linalg.inv(shapes), G, np.concatenate([geometry.directions[self.sensors], np.full(k, -1)])
 
 
 def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
@@ -173,8 +177,7 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
         if not isinstance(at, int | np.integer) or not 0 <= at < len(names):
             raise InputError(f"Modal: {one!r} is no sensor; the sensors are {', '.join(names)}")
         chosen.append(int(at))
-    if len(set(chosen)) < len(chosen):
-        raise InputError("Modal: a sensor is named twice")
+    refuse((len(set(chosen)) < len(chosen), "Modal: a sensor is named twice"))
     return np.sort(np.array(chosen, dtype=int))
 
 
@@ -186,16 +189,13 @@ def structure_of_modes(
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
     """
     geometry = problem.geometry
-    T = np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]])
-    P = np.linalg.inv(T)
-    G = np.vstack([geometry.rigid_body[chosen.sensors], np.zeros((chosen.modes.size, geometry.d))])
+    P, G, groups = chosen.coordinates(problem, modes.phi)
     recovery = modes.phi @ P
     # Exact where a degree of freedom is a sensor.
-    recovery[chosen.sensors] = np.eye(T.shape[0])[: chosen.sensors.size]
+    recovery[chosen.sensors] = np.eye(len(P))[: chosen.sensors.size]
     gamma = modes.gamma
     plain = chosen.modes.size == 0 and chosen.sensors.size == geometry.n
     if to_totals:
-        groups = np.concatenate([geometry.directions[chosen.sensors], np.full(chosen.modes.size, -1)])
         known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
@@ -299,15 +299,8 @@ def modal_structure(
     """Structure that the data suggest without any search, and how it was fitted.
 
     With a lumped or known mass it is where the local phase in the unknowns starts; its modal masses come from the
-    model.
-
-    Raises
-    ------
-    DoesNotApplyError
-        Where a stated frequency is none of the data's, these do not suffice, or the modes are too much alike at the
-        sensors.
-    InputError
-        Where the base force has the wrong sign, or stated sensors do not tell the modes apart.
+    model. A `DoesNotApplyError` where a stated frequency is none of the data's, these do not suffice, or the modes are
+    too much alike at the sensors.
     """
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
@@ -366,12 +359,8 @@ def held_to_totals(problem: Prepared, end: ModalFit, monitor: IterationMonitor, 
 def ended(problem: Prepared, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
     """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
 
-    The estimate itself where nobody wants to wait for it.
-
-    Raises
-    ------
-    DoesNotApplyError
-        Where modes move so much alike that no shapes can be told apart.
+    The estimate itself where nobody wants to wait for it; a `DoesNotApplyError` where modes move so much alike that no
+    shapes can be told apart.
     """
     within = _within_bounds(problem, estimate)
     if monitor.is_over or monitor.stopped is not None:
@@ -434,15 +423,12 @@ def _within(value: ca.MX, limit: float) -> ca.MX:
 
 def _modal_masses(problem: Prepared, modes: Modes, chosen: DegreesOfFreedom) -> Array:
     """Modal masses that what is stated of the mass makes likely, (m,)."""
-    geometry, k = problem.geometry, chosen.modes.size
-    P = np.linalg.inv(np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]]))
-    G = np.vstack([geometry.rigid_body[chosen.sensors], np.zeros((k, geometry.d))])
-    groups = np.concatenate([geometry.directions[chosen.sensors], np.full(k, -1)])
-    known = problem.known_mass
-    if np.all(np.isfinite(known)) and len(P) == geometry.n:
+    P, G, groups = chosen.coordinates(problem, modes.phi)
+    known, n = problem.known_mass, problem.geometry.n
+    if np.all(np.isfinite(known)) and len(P) == n:
         return of_known_mass(known, P, modes.gamma, G)
     # Known entries of a free mass are those of the sensors' own mass matrix.
-    ours = problem.formulation.mass.free and len(P) == geometry.n and k == 0
+    ours = problem.formulation.mass.free and len(P) == n and chosen.modes.size == 0
     return nearest_lumped(problem, P, modes.gamma, G, groups, known if ours else None)
 
 

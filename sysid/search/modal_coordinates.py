@@ -23,8 +23,7 @@ from sysid.models.unknowns import Unknown, lower_of, scales_of, split, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.modal_program import solve_modes
-from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
+from sysid.search.modal_program import positive_part, solve_modes, stated_totals, to_stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FREE, NEGLIGIBLE
 

@@ -28,7 +28,7 @@ from sysid.problem.batch import Batch, expanded, in_chunks
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ExpressionTerm, TestTerm
 from sysid.search import local
-from sysid.search.continuation import as_good_as
+from sysid.search.continuation import as_good_as, structure_of
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -43,30 +43,18 @@ _LESS, _MORE = 0.2, 5.0  # its change after a step that was taken, and after one
 class LeastSquares:
     """Levenberg and Marquardt's method from many starts in the unit box, all stepping together.
 
-    Parameters
-    ----------
-    rows : callable
-        (count, p) to residuals (count, m); what is not finite is never stepped to. What one point gives must not
-        depend on the others.
-    points : (count, p)
-        Starts within [0, 1]; then where each has come.
-
-    Attributes
-    ----------
-    left : (count,)
-        Norm of the residuals there.
-    idle : (count,)
-        Which have come to rest, as no step lowers what is left.
+    `rows` takes points (count, p) to residuals (count, m); what is not finite is never stepped to. What one point gives
+    must not depend on the others.
     """
 
     rows: Callable[[Array], Array]
-    points: Array
+    points: Array  # starts within [0, 1], (count, p); then where each has come
 
     def __post_init__(self) -> None:
         self._values = self.rows(self.points)
         self.left = _norms(self._values)
         self.damping = np.full(len(self.points), _FIRST)
-        self.idle: NDArray[np.bool_] = ~np.isfinite(self.left)
+        self.idle: NDArray[np.bool_] = ~np.isfinite(self.left)  # which have come to rest: no step lowers what is left
 
     def step(self) -> None:
         """One step of all that are not idle."""
@@ -121,12 +109,6 @@ class SameResponse:
 
     Responses relative to their size, further rows (what is stated as known, say) and broken constraints as the fit
     weighs them.
-
-    Parameters
-    ----------
-    problem : Prepared
-    x : (size,)
-        The answer.
     """
 
     def __init__(self, problem: Prepared, x: Array) -> None:
@@ -285,12 +267,12 @@ def _first(problem: Prepared, x: Array, session: Session, starts: int, most: int
     for point in _candidates(problem, x, session, objective, starts):
         if len(tried) > most or session.is_over:
             return None
-        structure = _structure_of(problem, point)
+        structure = structure_of(problem, point)
         if structure is None or any(_matrices_apart(structure, known) <= OTHER_ANSWER for known in tried):
             continue
         tried.append(structure)
         end = _fit(problem, point, session)
-        fitted = _structure_of(problem, end)
+        fitted = structure_of(problem, end)
         other = fitted is not None and _matrices_apart(fitted, tried[0]) > OTHER_ANSWER
         if other and _explains(problem, end, objective):
             return end
@@ -355,24 +337,19 @@ def _explains(problem: Prepared, x: Array, objective: float) -> bool:
     return problem.keeps_constraints(x) and problem.objective(x) <= as_good_as(problem, objective)
 
 
-def _structure_of(problem: Prepared, x: Array) -> Structure | None:
-    """None where the unknowns stand for none."""
-    try:
-        return problem.structure(x)
-    except InputError:
-        return None
-
-
 def _matrices_apart(one: Structure, other: Structure) -> float:
     """Largest difference of entries of M_SS, K_SS and C, each over the root of the other's two diagonal entries."""
-    n, most = one.n, 0.0
+    n = one.n
     pairs = (
         (one.mass[:n, :n], other.mass[:n, :n]),
         (one.stiffness[:n, :n], other.stiffness[:n, :n]),
         (one.damping, other.damping),
     )
-    for a, b in pairs:
-        size = np.sqrt(np.abs(np.diag(b)))
-        size[size == 0] = size.max() or 1.0  # a degree of freedom without a damper
-        most = max(most, float(np.max(np.abs(a - b) / np.outer(size, size))))
-    return most
+    return max(entries_apart(a, b, np.abs(np.diag(b))) for a, b in pairs)
+
+
+def entries_apart(a: Array, b: Array, diagonal: Array) -> float:
+    """Largest difference of entries of two matrices, each over the root of its two entries of a `diagonal`."""
+    size = np.sqrt(diagonal)
+    size[size == 0] = size.max() or 1.0  # a degree of freedom without a damper, a base without mass
+    return float(np.max(np.abs(a - b) / np.outer(size, size)))

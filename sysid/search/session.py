@@ -1,21 +1,168 @@
-"""Progress reporting, time limit and interruption of a search."""
+"""Progress, time limit and interruption of a search, and the journal from which it goes on after its process has ended.
+
+A search repeats bit for bit with the same seed. So it is enough to keep where its long parts ended, and the state of
+the one that runs: a resumed search takes the same way, and reads these in place of running them (`Journal`).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from types import FrameType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 
-from sysid.errors import Stop, as_float, function, whole_number
+from sysid.errors import InputError, Stop, as_float, function, whole_number
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.nlp import GRACE, suffices
-from sysid.search.journal import Journal
 from sysid.structure.structure import Array
+
+Tree = dict[str, Any]
+
+EVERY = 3.0  # s between two writings
+_SHARE = 0.05  # of the time that writing may take
+
+
+class Journal:
+    """The long parts of a search in their order.
+
+    Parameters
+    ----------
+    write : callable, optional
+        Keeps the entries that it is given; without it nothing is kept.
+    entries : dict, optional
+        Those of an earlier run of the same search: name and content of each part, by its number as a text.
+    every : float
+        s between two writings, at least; more where writing takes long.
+    """
+
+    def __init__(
+        self, write: Callable[[Tree], object] | None = None, entries: Tree | None = None, every: float = EVERY
+    ) -> None:
+        self.entries = dict(entries or {})
+        self._write, self._every = write, every
+        self._next, self._written, self._took = 0, time.perf_counter(), 0.0
+        self._unwritten = False
+
+    def part(self, name: str) -> Part:
+        """Begin the next part; an InputError where the earlier run had another one here."""
+        number, self._next = str(self._next), self._next + 1
+        found = self.entries.get(number)
+        if found is not None and found["part"] != name:
+            raise InputError(
+                f"the unfinished run had part {found['part']!r} where this one has {name!r}: it was of another search"
+            )
+        return Part(self, number, name, None if found is None else found["content"])
+
+    def keep(self, number: str, name: str, content: Callable[[], Tree], *, at_once: bool = False) -> None:
+        """Take the content of a part, where it is time to write, or anyway."""
+        due = time.perf_counter() - self._written > max(self._every, self._took / _SHARE)
+        if self._write is None or not (due or at_once):
+            return
+        # What came after an older state of this part does not follow from this one.
+        self.entries = {key: entry for key, entry in self.entries.items() if int(key) < int(number)}
+        self.entries[number] = {"part": name, "content": content()}
+        self._unwritten = True
+        if due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is not written."""
+        if self._write is None or not self._unwritten:
+            return
+        start = time.perf_counter()
+        self._write(self.entries)
+        self._written = time.perf_counter()
+        self._took, self._unwritten = self._written - start, False
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One part of a search; `found` is what an earlier run kept of it."""
+
+    journal: Journal
+    number: str
+    name: str
+    found: Tree | None
+
+    def running(self, content: Callable[[], Tree]) -> None:
+        """Keep its present state, where it is time to."""
+        self.journal.keep(self.number, self.name, content)
+
+    def ended(self, content: Callable[[], Tree]) -> None:
+        """Keep its end, or its state where it is stopped."""
+        self.journal.keep(self.number, self.name, content, at_once=True)
+
+
+class TimeIsOver(BaseException):  # no library's ``except Exception`` must take it
+    """The time is over."""
+
+
+@contextlib.contextmanager
+def within(seconds: float | None) -> Iterator[None]:
+    """Raise `TimeIsOver` in the midst of Python code once so many seconds have passed; None sets no limit.
+
+    Without POSIX signals, or outside the main thread, what has begun is not cut short. An alarm that somebody else has
+    set comes at its time, or where that has passed, at the end.
+    """
+    if seconds is not None and seconds <= 0:
+        raise TimeIsOver
+    if seconds is None:
+        yield
+        return
+    start = time.perf_counter()
+    try:
+        # Again every second: compiled code and __del__ lose an exception that strikes inside them.
+        with _alarm(_raise, seconds, 1.0):
+            yield
+    except Exception as error:  # compiled code makes another one of ours
+        if time.perf_counter() < start + seconds or not _can_alarm():
+            raise
+        raise TimeIsOver from error
+
+
+def regularly(call: Callable[[], object], every: float = 0.1) -> contextlib.AbstractContextManager[None]:
+    """Call a function every so many seconds in the midst of Python code; what it raises ends that.
+
+    Where `within` cuts nothing short it is not called.
+    """
+    return _alarm(lambda number, frame: call(), every, every)
+
+
+def _can_alarm() -> bool:
+    """True in the main thread, where there are POSIX signals."""
+    return threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+
+
+@contextlib.contextmanager
+def _alarm(handler: Callable[[int, FrameType | None], object], first: float, again: float) -> Iterator[None]:
+    """Handle an alarm after so many seconds, and then again and again; then the alarm is set as it was before."""
+    if not _can_alarm():
+        yield
+        return
+    start, before = time.perf_counter(), signal.signal(signal.SIGALRM, handler)
+    other, other_again = signal.setitimer(signal.ITIMER_REAL, first, again)
+    try:
+        yield
+    finally:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        finally:  # the alarm may have come just before
+            signal.signal(signal.SIGALRM, before)
+            if other > 0:
+                # Zero would set no alarm.
+                left = max(other - (time.perf_counter() - start), 1e-6)
+                signal.setitimer(signal.ITIMER_REAL, left, other_again)
+
+
+def _raise(number: int, frame: object) -> NoReturn:
+    raise TimeIsOver
+
 
 Phase = Literal["poles", "swarm", "continuation", "local phase", "other answers"]
 
@@ -58,10 +205,7 @@ class DeferredInterrupt:
     Where somebody else handles the signal, or outside the main thread, nothing changes. Within another one this one
     answers the signal: it takes over what that one holds, and hands all back at its end.
 
-    Parameters
-    ----------
-    patience : int or None
-        How many are held; the next one acts at once, whatever is lost. None holds all.
+    So many are held as there is `patience`; the next one acts at once, whatever is lost. None holds all.
     """
 
     def __init__(self, patience: int | None = 2) -> None:
@@ -111,18 +255,8 @@ class DeferredInterrupt:
 class Session:
     """The clock, the log, the listeners and the random source of an identification.
 
-    Parameters
-    ----------
-    listeners : list of callable
-        Called with a `Progress` at each iteration.
-    interrupt : DeferredInterrupt
-    max_time : float or None
-        s.
-    random : SeedSequence
-    max_evaluations : int or None
-        Candidates that a swarm may evaluate.
-    journal : Journal, optional
-        Keeps what the search has reached.
+    Listeners are called with a `Progress` at each iteration; `max_time` is in s, `max_evaluations` the candidates that
+    a swarm may evaluate.
     """
 
     def __init__(
@@ -178,13 +312,7 @@ class Session:
         self.lines.append(f"{self.seconds:8.2f} s  {line}")
 
     def report(self, phase: Phase, iteration: int, of: int, objective: float, doing: str = "") -> None:
-        """Tell the listeners of an iteration.
-
-        Raises
-        ------
-        Stop, KeyboardInterrupt
-            Where a listener or the user wants to stop.
-        """
+        """Tell the listeners of an iteration; a Stop or KeyboardInterrupt where one or the user wants to stop."""
         self.interrupt.check()
         if self.stop_asked is not None and phase != "poles":
             raise self.stop_asked

@@ -14,6 +14,9 @@ from sysid.problem.prepared import Prepared
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
 
+# Counted words of a history, and what their numbers are called in its tree.
+_COUNTED = {"states": "state_counts", "refinement_statuses": "refinement_counts"}
+
 
 @dataclass(frozen=True, eq=False)
 class Phase:
@@ -108,27 +111,20 @@ class History:
     def to_tree(self) -> dict[str, Any]:
         """Give all of it as numbers, arrays and texts; `from_tree` takes them back."""
         phases = [vars(phase) for phase in self.phases]
-        return {
-            **vars(self), "phases": phases,
-            **_counts("states", "state_counts", self.states),
-            **_counts("refinement_statuses", "refinement_counts", self.refinement_statuses),
-        }  # fmt: skip
+        tree = {**vars(self), "phases": phases}
+        for names, numbers in _COUNTED.items():
+            counted = tree[names]
+            tree[names] = tuple(name for name, _ in counted)
+            tree[numbers] = np.array([number for _, number in counted], dtype=np.int64)
+        return tree
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> History:
         """Give the history of a tree that `to_tree` made."""
         given = dict(tree)
-        for name, numbers in (("states", "state_counts"), ("refinement_statuses", "refinement_counts")):
-            given[name] = tuple(zip(tree[name], given.pop(numbers).tolist(), strict=True))
+        for names, numbers in _COUNTED.items():
+            given[names] = tuple(zip(tree[names], given.pop(numbers).tolist(), strict=True))
         return cls(**{**given, "phases": tuple(Phase(**phase) for phase in tree["phases"])})
-
-
-def _counts(names: str, numbers: str, counted: tuple[tuple[str, int], ...]) -> dict[str, Any]:
-    """Counted words as a text and an array, under these two names."""
-    return {
-        names: tuple(name for name, _ in counted),
-        numbers: np.array([number for _, number in counted], dtype=np.int64),
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,15 +187,7 @@ class Strategy(Protocol):
         """Why "auto" does not take it for a problem; None where it does."""
 
     def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
-        """Search.
-
-        Raises
-        ------
-        DoesNotApplyError
-            Where the strategy cannot be used for the problem.
-        InputError, SolverError
-            Where data or models are wrong, or nothing came out.
-        """
+        """Search; a `DoesNotApplyError` where it cannot be used for the problem."""
 
 
 class DoesNotApplyError(InputError):

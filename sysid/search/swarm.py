@@ -15,13 +15,11 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
-from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
-from sysid.search.refinement import RefineBy, Refiner, Tally
-from sysid.search.session import Session, in_time
+from sysid.search.session import Part, Session, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
-from sysid.search.swarm_objective import WORST, SwarmObjective
+from sysid.search.swarm_objective import WORST, RefineBy, Refiner, SwarmObjective, Tally
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
@@ -161,20 +159,13 @@ class Swarm:
     def searched(self, problem: Prepared, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
         """Objective of the swarm, and the tests with widened peaks, if any, through which the local phase goes."""
         formulation = problem.formulation
-        smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
         # With wide peaks more of the swarm is on a slope that leads somewhere.
-        steps = [] if smoother is None else smoother.steps[1:]
+        steps = [] if formulation.refinable else smoothed_tests(problem, session.preparing).steps[1:]
         spectrum = formulation.stiffness.spectrum if self.refine and formulation.refinable else None
         return SwarmObjective(problem, steps[0] if steps else (), spectrum), steps
 
     def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
-        """Search, and again from another swarm while there is no good fit; the best.
-
-        Raises
-        ------
-        DoesNotApplyError
-            Where there are more modes in the data than sensors, or known entries or a whole rigid-body mass are stated.
-        """
+        """Search, and again from another swarm while there is no good fit; the best."""
         refusal = self.refusal(problem, start)
         if refusal:
             raise DoesNotApplyError(refusal)
@@ -240,17 +231,16 @@ class _Search:
         return self.problem.objective(self.found)
 
     @property
-    def meets_goal(self) -> bool | None:
-        """True where the residual is at or below the goal; None where none is given."""
-        if self.problem.stated.goal is None or self.x is None:
-            return None
-        return self.problem.residual(self.x) <= self.problem.stated.goal
+    def meets_goal(self) -> bool:
+        """True where there is a goal, and the residual is at or below it."""
+        goal = self.problem.stated.goal
+        return goal is not None and self.problem.residual(self.found) <= goal
 
     @property
     def good_enough(self) -> bool:
         """True where another swarm is not worth its time; never while no solver vouches for the best."""
         if self.problem.stated.goal is not None:
-            return self.success and self.meets_goal is True
+            return self.success and self.meets_goal
         return self.success and (not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL)
 
     def beats(self, other: _Search) -> bool:
@@ -404,7 +394,7 @@ class _Search:
         ended = not self.session.cut_short
         self.trapped = ended and self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
         if self.trapped:
-            self.success = self.success and self.meets_goal is True
+            self.success = self.success and self.meets_goal
             self.message += f"; {_TRAPPED}"
             if self.problem.measurement.force is not None and self.problem.formulation.mass.totals is not None:
                 self.message += ", or the stated total contradicts the base force"

@@ -1,18 +1,23 @@
-"""The objective of a whole swarm at once, on compiled CasADi functions; by modes alone where the spectrum is held.
+"""The objective of a swarm's candidates, all at once, and the refinement of their eigenvalues (eq. 31).
 
-There the frequencies are the same for all candidates, so that all sums over lines are made once, before the search
-(`sysid.modal_analysis.gain_series`), and matrices and modes of a candidate are a few products of small arrays.
+Objectives are compiled CasADi functions. Where the spectrum is held, the frequencies are the same for all candidates,
+so that all sums over lines are made once, before the search (`sysid.modal_analysis.gain_series`), and matrices and
+modes of a candidate are a few products of small arrays. Eigenvalues are refined in closed form, through IPOPT, or of
+the leaders by both.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import dataclass, field
 from functools import partial
 from queue import SimpleQueue
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -20,12 +25,15 @@ import numpy as np
 from sysid.measurement.whole import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
+from sysid.models.expressions import triangle
+from sysid.models.spectrum import spectrum_error
 from sysid.problem.batch import CHUNK, Batch, BatchModes, batch_modes, expanded
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import Term, TestTerm
-from sysid.search.matrix_coordinates import terms_with
+from sysid.search.local import terms_with
+from sysid.search.session import Session
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import NEGLIGIBLE
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 _MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
@@ -35,16 +43,9 @@ _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the
 def held_spectrum_objective(
     problem: Prepared, term: Term, spectrum: Array | None, unknowns: ca.Function
 ) -> HeldSpectrumObjective | None:
-    """The fast objective of the problem's own test; None where it does not apply.
+    """The fast objective of the problem's own test, where all natural frequencies are held; None elsewhere.
 
-    It does where all natural frequencies are held.
-
-    Parameters
-    ----------
-    problem, term, spectrum
-        As in `HeldSpectrumObjective`; no spectrum where none is held.
-    unknowns : casadi.Function
-        The swarm's coordinates to the unknowns x.
+    `unknowns` takes the swarm's coordinates to x.
     """
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
@@ -60,7 +61,6 @@ class HeldSpectrumObjective:
 
     Parameters
     ----------
-    problem : Prepared
     term : TestTerm
         The problem's own test, or one in its place.
     spectrum : (n,), rad/s
@@ -72,12 +72,7 @@ class HeldSpectrumObjective:
     """
 
     def __init__(
-        self,
-        problem: Prepared,
-        term: TestTerm,
-        spectrum: Array,
-        expansion: ca.Function,
-        threads: int | None = None,
+        self, problem: Prepared, term: TestTerm, spectrum: Array, expansion: ca.Function, threads: int | None = None
     ) -> None:
         test = term.test
         batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
@@ -101,15 +96,7 @@ class HeldSpectrumObjective:
             self._expansions.put(copy(batch))
 
     def __call__(self, particles: Array, by_lines: Callable[[Array], Array]) -> Array:
-        """Of each candidate.
-
-        Parameters
-        ----------
-        particles : (count, n_variables)
-            Coordinates of the swarm.
-        by_lines : callable
-            The same summed over lines, for candidates near the records and those outside of the range of damping.
-        """
+        """Of each candidate; `by_lines` sums over lines, near the records and outside of the range of damping."""
         ends = chunk_ends(*particles.shape)
         chunks = self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)
         squared, inside = map(np.concatenate, zip(*chunks, strict=True))
@@ -184,15 +171,8 @@ class SwarmObjective:
     Constraints count by the feasibility rules of Deb (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever
     keeps them comes before what does not.
 
-    Parameters
-    ----------
-    problem : Prepared
-        Its healing is applied.
-    smoothed : sequence of TestTerm
-        In the place of the problem's tests, in their order.
-    spectrum : ndarray, optional
-        Circular frequencies, rad/s, that take the place of each candidate's own lowest ones (eigenvalue refinement in
-        closed form).
+    The healing of the problem is applied. `smoothed` are fitted in the place of its tests, in their order; a `spectrum`
+    (rad/s) takes the place of each candidate's own lowest frequencies (eigenvalue refinement in closed form).
     """
 
     def __init__(self, problem: Prepared, smoothed: Sequence[TestTerm] = (), spectrum: Array | None = None) -> None:
@@ -243,3 +223,91 @@ class SwarmObjective:
         part = formulation.parts.stiffness
         refined[part] = formulation.with_spectrum(x[None, part], self.spectrum)[0][0]
         return refined
+
+
+RefineBy = Literal["closed-form", "ipopt", "leaders"]
+
+
+@dataclass
+class Tally:
+    """Counts of the ends of IPOPT's refinements."""
+
+    tried: int = 0  # leaders of the swarm that IPOPT refined
+    won: int = 0  # those of them that it left at a lower objective than the closed form
+    statuses: Counter[str] = field(default_factory=Counter)  # of all that IPOPT refined
+
+    def add(self, other: Tally) -> None:
+        """Add the counts of another swarm."""
+        self.tried, self.won = self.tried + other.tried, self.won + other.won
+        self.statuses.update(other.statuses)
+
+    @property
+    def of_history(self) -> dict[str, Any]:
+        """The fields of `History`."""
+        return {
+            "leaders_tried": self.tried, "leaders_won": self.won,
+            "refinement_statuses": tuple(sorted(self.statuses.items())),
+        }  # fmt: skip
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the counts as numbers; `resume` takes them back."""
+        return {"tried": self.tried, "won": self.won, "statuses": dict(self.statuses)}
+
+    def resume(self, tree: dict[str, Any]) -> None:
+        """Go on from the counts of an earlier run."""
+        self.tried, self.won, self.statuses = tree["tried"], tree["won"], Counter(tree["statuses"])
+
+
+@dataclass(frozen=True, eq=False)
+class Refiner:
+    """Gives candidates the measured spectrum."""
+
+    problem: Prepared
+    by: RefineBy
+    spectrum: Array  # (m,), rad/s
+    session: Session  # IPOPT keeps to the time that it has left
+    tally: Tally
+
+    def rows(self, rows: Array) -> Array:
+        """Rows (k, n_variables), of the swarm or of unknowns alike, with refined entries of L_H; counted."""
+        refined, statuses = self._refined(rows, by_solver=self.by == "ipopt")
+        self.tally.statuses.update(statuses)
+        return refined
+
+    def one(self, x: Array) -> Array:
+        """The unknowns of the structure that `x` was given its objective for."""
+        return self._refined(x[None], by_solver=self.by == "ipopt")[0][0]
+
+    def error(self, x: Array) -> float:
+        """Largest relative difference of the unknowns' eigenvalues from those that were given."""
+        part = self.problem.formulation.parts.stiffness
+        return spectrum_error(triangle(x[part], self.problem.geometry.n), self.spectrum)
+
+    def of_leader(self, objective: Callable[[Array], Array]) -> Callable[[Array, float], tuple[Array, float]]:
+        """Function that refines a new leader, in the swarm's coordinates, for an objective of rows."""
+
+        def refine(row: Array, cost: float) -> tuple[Array, float]:
+            if self.session.is_over:
+                return row, cost
+            solved, statuses = self._refined(row[None], by_solver=True)
+            self.tally.tried += 1
+            self.tally.statuses.update(statuses)
+            closed = self._refined(row[None], by_solver=False)[0]
+            rows = np.clip(np.concatenate([closed, solved]), *self.problem.formulation.box)
+            of_closed, of_solved = objective(rows)
+            if of_solved < (1 - ROUND_OFF) * np.fmin(of_closed, cost):
+                self.tally.won += 1
+                return rows[1], float(of_solved)
+            # The leader's objective is the closed form's already, unless a bound cut that off.
+            return (rows[0], min(float(of_closed), cost)) if of_closed <= (1 + ROUND_OFF) * cost else (row, cost)
+
+        return refine
+
+    def _refined(self, rows: Array, *, by_solver: bool) -> tuple[Array, tuple[str, ...]]:
+        """Rows with refined entries of L_H, and IPOPT's status of each."""
+        refined, left = rows.copy(), None if self.session.max_time is None else self.session.left
+        part = self.problem.formulation.parts.stiffness
+        refined[:, part], statuses = self.problem.formulation.with_spectrum(
+            rows[:, part], self.spectrum, by_solver=by_solver, max_time=left
+        )
+        return refined, statuses

@@ -4,11 +4,9 @@
 evaluate the costs themselves, stop, store and go on.
 """
 
-from .adaptation import EvolutionaryState
-from .minimize import SwarmProgress, minimize_swarm
+from .adaptation import EvolutionaryState, SwarmSettings
+from .minimize import StopReason, SwarmProgress, minimize_swarm
 from .particles import ParticleSwarm
-from .settings import SwarmSettings
-from .stop import StopReason
 
 __all__ = [
     "EvolutionaryState",

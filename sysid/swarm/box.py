@@ -1,4 +1,4 @@
-"""The search box: units scaled to the range of each variable, and points spread over it."""
+"""The search box: units scaled to the range of each variable, points spread over it, checks of rows and costs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, numbers
+from sysid.errors import InputError, numbers, refuse
 
 
 def latin_hypercube(count: int, size: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -94,8 +94,8 @@ class Box:
     def point(self, x: ArrayLike, name: str) -> FloatArray:
         """Return `x` as a new (n_dim,) array; an error if it is not a point inside the bounds."""
         point = numbers(name, x)
-        if point.shape != self.lower.shape:
-            raise InputError(f"{name} has shape {point.shape}; give one number a variable, shape ({self.n_dim},).")
+        wrong = f"{name} has shape {point.shape}; give one number a variable, shape ({self.n_dim},)."
+        refuse((point.shape != self.lower.shape, wrong))
         outside = np.flatnonzero(~((point >= self.lower) & (point <= self.upper)))
         if outside.size:
             i = outside[0]
@@ -125,3 +125,21 @@ def _lower_and_upper(bounds: Any) -> tuple[FloatArray, FloatArray]:
         i = reversed_[0]
         raise InputError(f"bounds[{i}] = ({lower[i]}, {upper[i]}) has its lower above its upper; exchange the two.")
     return lower, upper
+
+
+def checked_costs(costs: ArrayLike, n_rows: int, origin: str) -> FloatArray:
+    """The costs, (n_rows,) real numbers, as floats; `origin` follows "The costs" in an error."""
+    values = np.asarray(costs)
+    of_shape = f"The costs {origin} have shape {values.shape} for {n_rows} rows; give one a row, shape ({n_rows},)."
+    of_kind = f"The costs {origin} have type {values.dtype}; give real numbers, such as the norm of a residual."
+    refuse((values.shape != (n_rows,), of_shape), (values.dtype.kind not in "biuf", of_kind))
+    return values.astype(float)
+
+
+def checked_rows(rows: ArrayLike, shape: tuple[int, ...], origin: str) -> FloatArray:
+    """Rows of a shape as finite floats; `origin` follows "The rows" in an error."""
+    values = np.asarray(rows, dtype=float)
+    of_shape = f"The rows {origin} have shape {values.shape}; give one a row that was asked for, {shape}."
+    endless = f"The rows {origin} are not all finite; leave a row that cannot be repaired as it was."
+    refuse((values.shape != shape, of_shape), (not np.isfinite(values).all(), endless))
+    return values

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, RandomSource, instance, random_generator, whole_number
 
 from . import adaptation
-from .adaptation import EvolutionaryState
-from .box import Box, latin_hypercube
-from .settings import SwarmSettings, checked_costs, checked_rows
+from .adaptation import EvolutionaryState, SwarmSettings
+from .box import Box, checked_costs, checked_rows, latin_hypercube
 
 FloatArray = NDArray[np.float64]
 
@@ -289,16 +288,13 @@ class ParticleSwarm:
         RuntimeError
             If rows have been asked for whose costs are not told.
         """
-        if self._asked is not None:
-            raise RuntimeError("inject was called between ask and tell; tell the costs of the asked rows first.")
+        self._check_idle("inject")
         point = self.box.point(x, "x")
         value = float(self._finite_or_inf(checked_costs([cost], 1, "injected"))[0])
-        if not value < self.best_cost:
-            return False
-        self._lead(self.box.to_unit(point), point, value)
-        if self.history:
-            self.history[-1] = value
-        return True
+        better = value < self.best_cost
+        if better:
+            self._take(point, value)
+        return better
 
     def replace_best(self, x: ArrayLike, cost: float) -> None:
         """Put another point in the place of the global best, between `tell` and the next `ask`.
@@ -319,14 +315,21 @@ class ParticleSwarm:
         RuntimeError
             If rows have been asked for whose costs are not told.
         """
-        if self._asked is not None:
-            raise RuntimeError("replace_best was called between ask and tell; tell the costs of the asked rows first.")
+        self._check_idle("replace_best")
         point, value = self.box.point(x, "x"), float(checked_costs([cost], 1, "given")[0])
         if not value <= self.best_cost:
             raise InputError(f"cost {value:g} is above that of the global best, {self.best_cost:g}; keep that one.")
-        self._lead(self.box.to_unit(point), point, value)
+        self._take(point, value)
+
+    def _check_idle(self, name: str) -> None:
+        if self._asked is not None:
+            raise RuntimeError(f"{name} was called between ask and tell; tell the costs of the asked rows first.")
+
+    def _take(self, point: FloatArray, cost: float) -> None:
+        """Make a point the global best, of the last iteration too."""
+        self._lead(self.box.to_unit(point), point, cost)
         if self.history:
-            self.history[-1] = value
+            self.history[-1] = cost
 
     def _finite_or_inf(self, values: FloatArray) -> FloatArray:
         finite = np.isfinite(values)

@@ -214,7 +214,7 @@ def test_a_result_is_no_state_and_a_state_no_result(tmp_path, state, uninterrupt
 def test_a_state_that_cannot_be_written_any_more_ends_no_search(tmp_path, monkeypatch, uninterrupted):
     """As on a disk that is full after the start: the last state that was written stays."""
     import sysid.results.checkpoint as module
-    import sysid.search.journal as journal
+    import sysid.search.session as journal
 
     monkeypatch.setattr(journal, "_SHARE", np.inf)  # however slow the disk, it writes at each iteration
     original, writes = module.to_bytes, []

@@ -16,7 +16,7 @@ from sysid.modal_analysis import fit as fit_module
 from sysid.modal_analysis.fit import fit_tests, whole_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.rough_poles import decimated_lines
-from sysid.search.deadline import regularly
+from sysid.search.session import regularly
 
 ROOT = Path(__file__).resolve().parents[2]
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

@@ -17,9 +17,8 @@ import sysid
 from sysid.finding import Finding, Severity
 from sysid.nlp import GRACE, IterationMonitor
 from sysid.results.answer import Answer
-from sysid.search.deadline import TimeIsOver, within
-from sysid.search.matrix_coordinates import fit_in_matrices
-from sysid.search.session import DeferredInterrupt, Session, in_time
+from sysid.search.local import fit_in_matrices
+from sysid.search.session import DeferredInterrupt, Session, TimeIsOver, in_time, within
 from sysid.search.swarm_objective import SwarmObjective
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

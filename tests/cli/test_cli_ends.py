@@ -15,8 +15,7 @@ from sysid.cli import main as cli
 from sysid.cli.starting import NOTHING_SAVED
 from sysid.report import report
 from sysid.results import storage
-from sysid.search.deadline import TimeIsOver, within
-from sysid.search.session import DeferredInterrupt
+from sysid.search.session import DeferredInterrupt, TimeIsOver, within
 from sysid.search.swarm_objective import SwarmObjective
 
 NOTHING = f"sysid: {NOTHING_SAVED}\n"

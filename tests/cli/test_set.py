@@ -54,7 +54,7 @@ def here(tmp_path, monkeypatch):
 def test_values_are_python_where_they_can_be_read_as_such_and_else_texts(here):
     settings = ["mass=3", "name=tip of the mast = x", "lines=(2, 1e1)", "noise=0.01", "rng=7"]
     command = ["run", "mast.py", *(part for setting in settings for part in ("--set", setting))]
-    recipe = cli.parameters.recipe_of(cli._parser().parse_args(command), Output())
+    recipe = cli.requests.recipe_of(cli.command_parser().parse_args(command), Output())
     assert recipe == Recipe(
         "mast.py", None, 7, {"mass": 3, "name": "tip of the mast = x", "lines": (2, 10.0), "noise": 0.01}
     )

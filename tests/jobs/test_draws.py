@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid.jobs import JobResult, processes, spreads, submit
-from sysid.jobs.draws import drawn
+from sysid.jobs.changes import drawn
 
 MODULE = '''"""Two floors, recorded with noise."""
 

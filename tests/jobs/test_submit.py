@@ -217,7 +217,7 @@ def test_a_start_that_leads_to_an_error_of_any_kind_leaves_the_others(recipe, mo
 
 def test_a_worker_in_another_folder_finds_module_and_data(recipe, tmp_path, monkeypatch):
     """A module of the package is found by its name there too; what it reads is the user's."""
-    from sysid.jobs.submit import _rooted
+    from sysid.jobs.submission import _rooted
 
     (tmp_path / "records").mkdir()
     for module in ("mini_shake_table", "some.dotted.module"):
@@ -294,11 +294,11 @@ class TestLedger:
         assert [again("records"), again("records")] == [1, 0]
 
     def test_another_version_of_sysid_makes_other_jobs_and_opens_the_ledger(self, recipe, tmp_path, ran, monkeypatch):
-        from sysid.jobs import ledger
+        from sysid.jobs import submission
 
         list(submit(recipe, starts=2, out=tmp_path))
         with monkeypatch.context() as patch:
-            patch.setattr(ledger, "__version__", "0.0.9")
+            patch.setattr(submission, "__version__", "0.0.9")
             list(submit(recipe, starts=2, out=tmp_path))
         assert len(ran) == 4
         assert len(list(submit(recipe, starts=2, out=tmp_path))) == 2

@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.cli.output import Output
-from sysid.cli.sweeps import sweep_of
+from sysid.cli.refine import sweep_of
 from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, NumberOfModes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.modal_analysis.residues import linear_residues

@@ -17,7 +17,7 @@ from sysid.modal_analysis.residues import linear_residues
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.search import local
-from sysid.search.matrix_coordinates import _gauss_newton
+from sysid.search.local import _gauss_newton
 from sysid.search.modal_coordinates import (
     _linear_starts,
     _regular_inverse,

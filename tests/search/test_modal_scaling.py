@@ -11,7 +11,7 @@ from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.response import weighted_error
 from sysid.nlp import IterationMonitor
 from sysid.search.modal import held_to_totals
-from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.modal_program import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
 
 
 def lines(truth, count=200):

@@ -8,8 +8,8 @@ import pytest
 
 import sysid
 from sysid.models.spectrum import Refinement, by_ipopt
-from sysid.search.refinement import Refiner, Tally
 from sysid.search.session import DeferredInterrupt, Session
+from sysid.search.swarm_objective import Refiner, Tally
 
 FEW = {"max_iterations": 6, "n_particles": 20, "local": None}
 
