@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import one_line_each, reliability, statements
+from sysid.export.content import one_line_each, reliability
 from sysid.results.identification import Identification
 from sysid.structure.sensor import Sensor, sensor_row
 from sysid.structure.structure import Array
 
-PRECISION = "6 significant digits: dataset 55 prescribes the number format E13.5"
 _SI = f"{1.0:25.17E}".replace("E", "D") * 3
 _NORMAL_MODE, _STRUCTURAL, _DISPLACEMENT, _REAL = 2, 1, 8, 2
 
 
-def write_uff55(it: Identification, path: Path) -> None:
+def write_uff55(it: Identification, about: tuple[str, ...], path: Path) -> None:
     """Write frequency, damping ratio and shape of each mode on the fixed base, mass-normalised (modal mass 1 kg).
 
     Sensors at one place are one node; its motion is the least one that its sensors' signals have in common. Where
@@ -27,7 +26,7 @@ def write_uff55(it: Identification, path: Path) -> None:
     places, shapes = _nodes(sensors, structure.mode_shapes) if sensors else _in_x(structure.mode_shapes)
     where = "" if sensors else "sensors are not described: node k is sensor k, its motion stands in x"
     lines = [
-        *_set(151, _header(it, where)),
+        *_set(151, one_line_each([text for text in (*about, where) if text], 80)),  # more lines than it asks for
         *_set(164, (f"{1:10d}{'SI: meter, newton':<20}{2:10d}", _SI, f"{273.15:25.17E}".replace("E", "D"))),
         *_set(15, (f"{k:10d}{0:10d}{0:10d}{11:10d}" + _reals(place) for k, place in enumerate(places, 1))),
     ]
@@ -37,11 +36,6 @@ def write_uff55(it: Identification, path: Path) -> None:
         figures = structure.natural_frequencies[mode], 1.0, structure.damping_ratios[mode], 0.0
         lines += _set(55, _mode(mode + 1, figures, shapes[:, :, mode], titles))
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def _header(it: Identification, where: str) -> list[str]:
-    """All that the file says of itself, in lines of 80 characters: more of them than dataset 151 asks for."""
-    return one_line_each([text for text in (*statements(it, PRECISION), where) if text], 80)
 
 
 def _mode(number: int, figures: Sequence[float], shape: Array, titles: Sequence[str]) -> Iterator[str]:

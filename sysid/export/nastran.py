@@ -1,23 +1,44 @@
-"""The Craig-Bampton superelement as direct matrix input (DMIG) of Nastran, in fields of 16 characters."""
+"""Matrices and the Craig-Bampton superelement for Nastran: binary OUTPUT4, and direct matrix input (DMIG)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sysid.export.content import one_line_each, statements, superelement_of
+import numpy as np
+
+from sysid.export.content import matrices_of, one_line_each, superelement_of
 from sysid.results.identification import Identification
 from sysid.structure.sensor import BASE_AXES
 from sysid.structure.structure import Array
 
-PRECISION = "10 significant digits: what 16 characters, the widest field of bulk data, hold beside sign and exponent"
 BASE, FIRST_MODE, FIRST_SENSOR = 1, 1_001, 100_001  # identification numbers of points
 _SYMMETRIC, _RECTANGULAR = 6, 2
 
 Point = tuple[int, int]  # its number and component
 
 
-def write_dmig(it: Identification, path: Path) -> None:
+def write_op4(it: Identification, about: tuple[str, ...], path: Path) -> None:
+    """Write M, K, C; MCB, KCB, CCB, RCB; DETERMND and NOTE with pyYeti.
+
+    M, K and C have the structure's degrees of freedom first, those of the base last. MCB, KCB and CCB have those of the
+    base first, then the modal coordinates, and RCB takes these to the absolute motion of the sensors. DETERMND is 1
+    where data and stated model fix every entry, else 0. The format has no place for text: NOTE holds the characters of
+    what the file says of itself as numbers (ASCII), one line a row: ``char(NOTE)`` in MATLAB.
+    """
+    from pyyeti.nastran import op4
+
+    form, lines = superelement_of(it.structure), one_line_each(about, 72)
+    matrices = {
+        **matrices_of(it.structure),
+        "MCB": form.mass, "KCB": form.stiffness, "CCB": form.damping, "RCB": form.recovery,
+        "DETERMND": np.array([[float(it.determined)]]),
+        "NOTE": np.array([[float(ord(letter)) for letter in line.ljust(72)] for line in lines]),
+    }  # fmt: skip
+    op4.write(str(path), list(matrices), list(matrices.values()), sparse="dense")
+
+
+def write_dmig(it: Identification, about: tuple[str, ...], path: Path) -> None:
     """Write points and the matrices MCB, KCB, BCB (mass, stiffness, viscous damping) and RCB (motion of the sensors).
 
     The base is grid point 1, components as its axes; modal coordinates are scalar points from 1001 on. RCB has the
@@ -31,7 +52,7 @@ def write_dmig(it: Identification, path: Path) -> None:
     sensors = [(FIRST_SENSOR + k, 0) for k in range(structure.n_sensors)]
     fixed = "".join(str(c + 1) for c, axis in enumerate(BASE_AXES) if axis not in axes)
     lines = [
-        *one_line_each((*statements(it, PRECISION), *_usage(it)), 72, "$ "),
+        *one_line_each((*about, *_usage(it)), 72, "$ "),
         f"GRID,{BASE},,0.,0.,0.,,{fixed}".rstrip(","),
         f"SPOINT,{FIRST_MODE},THRU,{FIRST_MODE + structure.n - 1}" if structure.n > 1 else f"SPOINT,{FIRST_MODE}",
         *_matrix("MCB", form.mass, rows, rows, _SYMMETRIC),
@@ -55,20 +76,15 @@ def _usage(it: Identification) -> list[str]:
 
 
 def _matrix(name: str, matrix: Array, rows: Sequence[Point], columns: Sequence[Point], form: int) -> Iterator[str]:
-    """Lines of a matrix; of a symmetric one the lower triangle, as each entry may stand only once."""
+    """Lines of a matrix in fields of 16 characters; of a symmetric one each entry once: the lower triangle."""
     width = len(columns) if form == _RECTANGULAR else ""
     yield f"DMIG    {name:<8}{0:>8}{form:>8}{2:>8}{0:>8}{'':16}{width:>8}".rstrip()
     for j, (point, component) in enumerate(columns):
         first = j if form == _SYMMETRIC else 0
         # A larger negative exponent has no room in a field.
         entries = [i for i in range(first, len(rows)) if abs(matrix[i, j]) > 1e-90]
-        if not entries:
-            continue
-        yield f"DMIG*   {name:<16}{point:>16}{component:>16}"
+        if entries:
+            yield f"DMIG*   {name:<16}{point:>16}{component:>16}"
         for i in entries:
-            yield f"*       {rows[i][0]:>16}{rows[i][1]:>16}{_field(matrix[i, j])}"
-
-
-def _field(value: float) -> str:
-    """A number of double precision in 16 characters, ten digits: ``-1.234567890D+05``."""
-    return f"{value:>16.9E}".replace("E", "D")
+            number = f"{matrix[i, j]:>16.9E}".replace("E", "D")  # of double precision
+            yield f"*       {rows[i][0]:>16}{rows[i][1]:>16}{number}"
