@@ -8,9 +8,8 @@ from pathlib import Path
 
 from sysid.errors import InputError, instance, needed, path_of
 from sysid.export.content import statements
-from sysid.export.nastran import write_dmig, write_op4
+from sysid.export.other_programs import write_dmig, write_op4, write_uff55
 from sysid.export.tables import write_matlab, write_text
-from sysid.export.uff55 import write_uff55
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically
 

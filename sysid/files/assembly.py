@@ -12,13 +12,12 @@ from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_column, rate_of
-from sysid.files.spectral import TIME_NAMES, is_abscissa
+from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
 _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
-_TURNS = {True: ("angular acceleration",), False: ("acceleration",)}
+_MOTION = {True: "angular acceleration", False: "acceleration"}  # by whether a sensor is one of rotation
 
 
 def assembled_in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
@@ -158,7 +157,7 @@ def _time_column(recording: Recording, said: Description) -> Column | None:
     if said.time is not None:
         return recording.column(said.time)
     used = {str(channel.column) for channel in said.channels}
-    found = [column for column in recording.columns if column.name.lower() in TIME_NAMES and column.name not in used]
+    found = [column for column in recording.columns if is_time(column.name) and column.name not in used]
     return found[0] if len(found) == 1 and said.sample_rate is None else None
 
 
@@ -202,7 +201,7 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
             "unit out of the description"
         )
     turns = isinstance(channel.axis, str) and "r" in channel.axis
-    wanted = ("moment" if turns else "force") if channel.role == "force" else _TURNS[turns][0]
+    wanted = ("moment" if turns else "force") if channel.role == "force" else _MOTION[turns]
     if known.quantity != wanted:
         raise InputError(
             f"{place}: {text!r} is a {known.quantity}, and a {channel.role} sensor along {channel.axis} gives "

@@ -13,8 +13,7 @@ import numpy as np
 
 from sysid.errors import InputError, shown
 from sysid.files import units
-from sysid.files.recording import Column, Recording
-from sysid.files.spectral import part_of
+from sysid.files.recording import Column, Recording, part_of
 from sysid.structure.structure import Array
 
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, path_of, refuse
-from sysid.files import arrays, assembly, delimited, responses, spectral, universal, xsens_dot
+from sysid.files import arrays, assembly, delimited, responses, universal, xsens_dot
 from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
-from sysid.files.recording import Recording
+from sysid.files.recording import Recording, recognised
 from sysid.measurement.measurement import Measurement
 
 _READERS: dict[str, Callable[[Path], Recording]] = {
@@ -77,7 +77,7 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         recordings = assembly.by_folder(recordings, said)
     else:
         _check_one_each(recordings, said)
-    recordings = [spectral.recognised(recording, said) for recording in recordings]
+    recordings = [recognised(recording, said) for recording in recordings]
     spectra = {recording.freq is not None for recording in recordings}
     if len(spectra) > 1:
         raise InputError("some files hold records in time and some spectra: read them apart")
