@@ -17,10 +17,9 @@ from sysid.files.recording import Column, Recording, is_abscissa
 from sysid.files.tree import Allowance, check_all_links, check_data
 
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "srate")
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read_npz(path: Path) -> Recording:
+def read_npz(path: Path) -> list[Recording]:
     """Arrays of an NPZ file; nothing pickled is loaded."""
     try:
         _check_npz(path)
@@ -31,7 +30,7 @@ def read_npz(path: Path) -> Recording:
         raise InputError(
             f"{path} is no NPZ, or is damaged ({words}): write it with numpy.savez, of numbers alone"
         ) from None
-    return recording(path, named)
+    return _recordings(path, named)
 
 
 def _check_npz(path: Path) -> None:
@@ -50,11 +49,13 @@ def _check_npz(path: Path) -> None:
                 raise InputError(f"{shown(member.filename)} claims {math.prod(shape)} entries, and holds fewer")
 
 
-def read_mat(path: Path) -> Recording:
+def read_mat(path: Path) -> list[Recording]:
     """Arrays of a MATLAB file of any version."""
     from scipy.io import loadmat
 
-    if _is_hdf5(path):
+    with path.open("rb") as file:
+        begin = file.read(520)
+    if b"\x89HDF\r\n\x1a\n" in (begin[:8], begin[512:]):  # behind 512 bytes of text in version 7.3
         return read_hdf5(path)
     try:
         check_matlab(path)
@@ -62,10 +63,10 @@ def read_mat(path: Path) -> Recording:
     except Exception as error:  # scipy raises many
         words = str(error) or type(error).__name__
         raise InputError(f"{path} is no MATLAB file, or is damaged ({words}): save it again") from None
-    return recording(path, dict(_flat({name: one for name, one in found.items() if not name.startswith("__")})))
+    return _recordings(path, dict(_flat({name: one for name, one in found.items() if not name.startswith("__")})))
 
 
-def read_hdf5(path: Path) -> Recording:
+def read_hdf5(path: Path) -> list[Recording]:
     """Datasets of an HDF5 file, by their paths in it; an attribute ``unit`` or ``units`` is their unit."""
     import h5py
 
@@ -75,7 +76,9 @@ def read_hdf5(path: Path) -> Recording:
     def visit(name: str, item: Any) -> None:
         # MATLAB keeps the sizes of empty arrays, and texts as numbers.
         text = _word(item, "MATLAB_class") in ("char", "cell") or "MATLAB_empty" in item.attrs
-        if isinstance(item, h5py.Dataset) and not (name.startswith("#") or text) and _is_numeric(item.dtype):
+        if not isinstance(item, h5py.Dataset) or name.startswith("#") or text:
+            return
+        if item.dtype.kind in "buifcV" and not item.dtype.hasobject:  # numbers, each of the same few bytes
             check_data(item, allowance)
             unit = _word(item, "unit") or _word(item, "units")
             named[name.replace("/", ".")] = (_values(item[()]), unit)
@@ -88,14 +91,7 @@ def read_hdf5(path: Path) -> Recording:
     except Exception as error:  # h5py raises many
         raise InputError(f"{path} is no HDF5, or is damaged ({error}): write it again") from None
     # MATLAB stores its arrays column by column.
-    return recording(path, {name: (one.T if matlab else one, unit) for name, (one, unit) in named.items()})
-
-
-def _is_hdf5(path: Path) -> bool:
-    """True where it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
-    with path.open("rb") as file:
-        begin = file.read(520)
-    return _HDF5 in (begin[:8], begin[512:])
+    return _recordings(path, {name: (one.T if matlab else one, unit) for name, (one, unit) in named.items()})
 
 
 def _word(item: Any, name: str) -> str:
@@ -104,11 +100,6 @@ def _word(item: Any, name: str) -> str:
         return ""
     value = np.asarray(item.attrs[name]).item()
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def _is_numeric(dtype: Any) -> bool:
-    """True where a data set holds numbers, each of the same few bytes."""
-    return dtype.kind in "buifcV" and not dtype.hasobject
 
 
 def _values(array: Any) -> Any:
@@ -126,7 +117,7 @@ def _flat(tree: dict[str, Any], above: str = "") -> Iterator[tuple[str, tuple[An
             yield above + name, (np.asarray(value), "")
 
 
-def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
+def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording]:
     """Columns of arrays: a vector is one, a matrix one a row or column along the longer side, ``name[1]`` and so on.
 
     Raises
@@ -156,7 +147,7 @@ def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
     columns = tuple(
         Column(name, one, unit, f"array {name!r}") for name, (one, unit) in vectors.items() if name not in other
     )
-    return Recording(path, columns, rate, remarks=tuple(remarks))
+    return [Recording(path, columns, rate, remarks=tuple(remarks))]
 
 
 def _lines(array: Any, along: set[int]) -> Any:

@@ -63,11 +63,9 @@ class RecordedTest:
     base_axes : tuple of str
     origin : tuple of float
         The base point, m.
-    sample_rate : float or None
-        Hz, of records in time.
-    freq : (n,) or None
-        Hz, of spectra.
-    table : tuple of Row
+    sample_rate, freq : float or None, (n,) or None
+        Hz: one of both, of records in time or of spectra.
+    table : tuple of ChannelRow
         Of all channels, file by file.
     remarks : tuple of str
         What was left out, recognised or mended.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sysid.errors import InputError, needed
+from sysid.errors import InputError, needed, refuse
 from sysid.files import units
 from sysid.files.recording import Column, Recording, rate_of
 
@@ -40,12 +40,8 @@ _NO_LABEL = ("", "NONE")
 def read_universal(path: Path) -> list[Recording]:
     """The recordings of a universal file: its time records, or its spectra, run by run.
 
-    A load case is a run; a function without reference is told by its node and direction, as in ``12+X``.
-
-    Raises
-    ------
-    InputError
-        Without pyuff; a file cut short, of another type, without sets 58; lengths that differ.
+    A load case is a run; a function without reference is told by its node and direction, as in ``12+X``. Refused is a
+    file cut short, of another type, without sets 58, or whose lengths differ.
     """
     sets = _sets(path)
     stated = next((one for one in sets if one.get("type") == 164), {})
@@ -54,14 +50,14 @@ def read_universal(path: Path) -> list[Recording]:
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
     used = [(at, one) for at, one in functions if one["func_type"] in _READ]
-    if not used:
-        found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
-        raise InputError(
-            f"{path} holds no time records or frequency responses: sets {found}"
-            f"{', functions ' + ', '.join(sorted(kinds)) if kinds else ''}; export functions as sets 58 or 58b"
-        )
-    if len({one["func_type"] == 1 for _, one in used}) > 1:
-        raise InputError(f"{path} holds time records and frequency responses: export one kind into a file of its own")
+    found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
+    found += f", functions {', '.join(sorted(kinds))}" * bool(kinds)
+    none = f"no time records or frequency responses: sets {found}; export functions as sets 58 or 58b"
+    mixed = len({one["func_type"] == 1 for _, one in used}) > 1
+    refuse(
+        (not used, f"{path} holds {none}"),
+        (mixed, f"{path} holds time records and frequency responses: export one kind into a file of its own"),
+    )
     runs: dict[int, list[tuple[int, dict[str, Any]]]] = {}
     for at, one in used:
         runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
@@ -148,11 +144,10 @@ def _recording(
             "export tests of another length or rate with another load case, or into a file of their own"
         )
     x = np.asarray(first["x"], float)[: columns[0].values.size]
-    if first["func_type"] == 1:
-        if not first["abscissa_spacing"]:
-            return Recording(path, columns, sample_rate=rate_of(x, path, f"set {run[0][0]}"))
-        return Recording(path, columns, sample_rate=1 / first["abscissa_inc"])
-    return Recording(path, columns, freq=x)
+    if first["func_type"] != 1:
+        return Recording(path, columns, freq=x)
+    even = first["abscissa_spacing"]
+    return Recording(path, columns, 1 / first["abscissa_inc"] if even else rate_of(x, path, f"set {run[0][0]}"))
 
 
 def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -162,11 +157,8 @@ def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: _Units) -> Column:
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
-    if values.size < one["num_pts"]:
-        raise InputError(
-            f"{path}, set {at} ({name}): {values.size} of {one['num_pts']} values are there: it is cut short, or not "
-            "of the precision that it says; export it again"
-        )
+    words = f"{values.size} of {one['num_pts']} values are there: it is cut short, or not of the precision that it says"
+    refuse((values.size < one["num_pts"], f"{path}, set {at} ({name}): {words}; export it again"))
     spectrum = one["func_type"] == 4
     upper = _unit(one, "ordinate", file_units)
     lower = _unit(one, "orddenom", file_units) if spectrum else ""
