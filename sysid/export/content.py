@@ -46,15 +46,10 @@ def entry_unit(letter: str, row: bool | None, column: bool | None) -> str:
 
 def rotations_of(it: Identification) -> tuple[bool | None, ...]:
     """Which rows of the matrices are rotations; None for a coordinate that no sensor records, which may be anything."""
-    turned = (None if j < 0 else _records_rotation(it, j) for j in it.structure.dof_sensors)
+    axes = [sensor.axis for sensor in it.measurement.sensors or ()] or [""] * it.structure.n_sensors
+    turns = [isinstance(axis, str) and "r" in axis for axis in axes]
+    turned = (turns[j] if j >= 0 else None for j in it.structure.dof_sensors)
     return (*turned, *(axis.startswith("r") for axis in it.measurement.base_axes or ()))
-
-
-def _records_rotation(it: Identification, sensor: int) -> bool:
-    """True where a sensor is described as one of rotation."""
-    sensors = it.measurement.sensors
-    axis = "" if sensors is None else sensors[sensor].axis
-    return isinstance(axis, str) and "r" in axis
 
 
 _WORTH = {

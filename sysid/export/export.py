@@ -16,29 +16,14 @@ from sysid.results.storage import atomically
 
 @dataclass(frozen=True)
 class Format:
-    """A format.
+    """A format, its writer, and what its files can hold."""
 
-    Attributes
-    ----------
-    write : callable
-        Of the result, what the file says of itself, and the path.
-    name : str
-    note : str
-        Where its files say what they are worth.
-    precision : str
-        Of its numbers, and where it comes from.
-    deviations : bool
-        Whether it has a place for them.
-    needs, extra : str
-        A package, and the extra of ours that has it; "" without any.
-    """
-
-    write: Callable[[Identification, tuple[str, ...], Path], None]
+    write: Callable[[Identification, tuple[str, ...], Path], None]  # of the sentences of the file too
     name: str
-    note: str
+    note: str  # where its files say what they are worth
     precision: str
-    deviations: bool = False
-    needs: str = ""
+    deviations: bool = False  # whether it has a place for them
+    needs: str = ""  # a package, of the extra
     extra: str = ""
 
 

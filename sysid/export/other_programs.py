@@ -94,7 +94,7 @@ _NORMAL_MODE, _STRUCTURAL, _DISPLACEMENT, _REAL = 2, 1, 8, 2
 
 
 def write_uff55(it: Identification, about: tuple[str, ...], path: Path) -> None:
-    """Write nodes (dataset 15) and each mode on the fixed base (55): frequency, damping ratio, shape for 1 kg modal mass.
+    """Write nodes (dataset 15) and each mode on the fixed base (55): frequency, damping ratio, shape of modal mass 1.
 
     Sensors at one place are one node; its motion is the least one that its sensors' signals have in common. Where
     sensors are not described, each is a node at the origin with its motion in x, and the file says so.

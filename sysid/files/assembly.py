@@ -254,12 +254,8 @@ def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
 def by_folder(recordings: Sequence[Recording], said: Description) -> list[Recording]:
     """The recordings of each folder as one, in the order of the folders.
 
-    A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency.
-
-    Raises
-    ------
-    InputError
-        Files of other times or rates, or longer than others by more than a hundredth.
+    A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency. Refused are
+    files of other times or rates, or longer than others by more than a hundredth.
     """
     folders = dict.fromkeys(recording.path.parent for recording in recordings)
     return [_together([one for one in recordings if one.path.parent == folder], said) for folder in folders]
@@ -267,14 +263,13 @@ def by_folder(recordings: Sequence[Recording], said: Description) -> list[Record
 
 def _together(recordings: Sequence[Recording], said: Description) -> Recording:
     first = recordings[0]
-    shared = _abscissa(first, said)
     lengths = [recording.columns[0].values.size for recording in recordings]
     n = min(lengths)
-    columns = [replace(one, values=one.values[:n]) for one in (shared,) if one is not None]
+    columns = [replace(one, values=one.values[:n]) for one in _abscissa(first, said)]
     for recording in recordings:
         _check_same(first, recording, said, n, max(lengths))
-        abscissa = _abscissa(recording, said)
-        others = [column for column in recording.columns if column is not abscissa]
+        shared = [id(column) for column in _abscissa(recording, said)]
+        others = [column for column in recording.columns if id(column) not in shared]
         for column in others:
             stem = recording.path.stem
             name = stem if len(others) == 1 else f"{stem}.{column.name}"
@@ -286,26 +281,24 @@ def _together(recordings: Sequence[Recording], said: Description) -> Recording:
     return Recording(first.path, tuple(columns), first.sample_rate, first.freq, tuple(remarks))
 
 
-def _abscissa(recording: Recording, said: Description) -> Column | None:
-    """Time or frequency of a file."""
-    named = said.time if said.time is not None else said.frequency
-    if named is not None:
-        return recording.column(named)
-    return next((column for column in recording.columns if is_abscissa(column.name)), None)
+def _abscissa(recording: Recording, said: Description) -> list[Column]:
+    """The column of time or frequency of a file, stated or the first named so; none where there is none."""
+    stated = [recording.column(name) for name in (said.time, said.frequency) if name is not None]
+    return (stated or [column for column in recording.columns if is_abscissa(column.name)])[:1]
 
 
 def _check_same(first: Recording, other: Recording, said: Description, n: int, longest: int) -> None:
-    a, b = _abscissa(first, said), _abscissa(other, said)
+    abscissas = _abscissa(first, said), _abscissa(other, said)
     size = other.columns[0].values.size
     together = "are these files of one run, on one clock? Else read them apart, or bring them to it with sysid.resample"
     alike = f"{other.path}, beside {first.path}: one has a column of time or frequency, one has none"
     rates = f"{other.path} has another sample rate than {first.path}: {together}"
     refuse(
         (longest - size > 0.01 * longest, f"{other.path} has {size} samples, another file {longest}: {together}"),
-        ((a is None) != (b is None), alike),
+        (len(abscissas[0]) != len(abscissas[1]), alike),
         (first.sample_rate != other.sample_rate, rates),
     )
-    if a is not None and b is not None:
+    for a, b in zip(*abscissas, strict=True):
         step = float(np.median(np.abs(np.diff(np.real(a.values)))))
         off = np.abs(np.real(a.values[:n]) - np.real(b.values[:n])) > 0.01 * step
         at = int(np.argmax(off))

@@ -89,10 +89,9 @@ def _text(path: Path) -> str:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
     if not content.strip():
         raise InputError(f"{path} is empty")
-    if content.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):  # begins as UTF-16 does
-        return content.decode("utf-32", "replace")
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", "replace")
+    for size in (32, 16):  # in this order: the longer mark begins as the shorter one
+        if content.startswith(tuple(getattr(codecs, f"BOM_UTF{size}_{order}") for order in ("LE", "BE"))):
+            return content.decode(f"utf-{size}", "replace")
     head = content[:4000]
     if head.count(0) > len(head) // 4:  # Latin letters in UTF-16 without its mark: every other byte is zero
         return content.decode("utf-16-le" if head[1::2].count(0) > head[::2].count(0) else "utf-16-be", "replace")

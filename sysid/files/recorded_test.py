@@ -26,19 +26,7 @@ Run = tuple[Array, Array, Array | None]
 
 @dataclass(frozen=True)
 class ChannelRow:
-    """One channel in the table of what was read.
-
-    Attributes
-    ----------
-    column, sensor, role, axis, unit : str
-        `unit` is the file's.
-    factor : float
-        By which its numbers were multiplied to be in SI units.
-    rms : float
-        In SI units, without the mean of a record in time.
-    source : str
-        File.
-    """
+    """One channel in the table of what was read; `unit`, `factor` to SI are the file's, `rms` is SI, without a mean."""
 
     column: str
     sensor: str

@@ -94,13 +94,9 @@ class Recording:
         found = [column for column in self.columns if column.name == wanted]
         if isinstance(wanted, int) or (wanted.isdecimal() and not found):
             found = [column for at, column in enumerate(self.columns, 1) if at == int(wanted)]
-        refuse(
-            (not found, f"{self.path} has no column {wanted!r}: {self.in_words()}"),
-            (
-                len(found) > 1,
-                f"{self.path} has {len(found)} columns named {wanted!r}: name them by their numbers from 1",
-            ),
-        )
+        if len(found) != 1:
+            several = f"{len(found)} columns named {wanted!r}: name them by their numbers from 1"
+            raise InputError(f"{self.path} has {several if found else f'no column {wanted!r}: {self.in_words()}'}")
         return found[0]
 
     def in_words(self) -> str:

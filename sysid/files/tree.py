@@ -44,18 +44,7 @@ _FILTERS = (1, 2, 3, 4, 5, 6, 32000)
 
 
 def to_bytes(tree: Tree, number: int) -> bytes:
-    """The file of a tree.
-
-    Parameters
-    ----------
-    tree : dict
-    number : int
-        Of the format, for whoever reads the tree.
-
-    Returns
-    -------
-    bytes
-        The same for the same tree, whatever the order of its keys.
+    """The file of a tree, with the number of its format: the same bytes for one tree, whatever the order of its keys.
 
     Raises
     ------
@@ -132,13 +121,7 @@ def _read(group: Any, allowance: Allowance, before: set[int]) -> Any:
 
 
 def check_tree(value: Any, at: str = "") -> None:
-    """Refuse what cannot stand in a tree.
-
-    Raises
-    ------
-    InputError
-        Says where it stands and what may stand there.
-    """
+    """Refuse what cannot stand in a tree: the InputError says where it stands and what may stand there."""
     if isinstance(value, dict):
         for name, part in value.items():
             if not isinstance(name, str) or not name or name in (".", _LENGTH) or "/" in name or "\0" in name:

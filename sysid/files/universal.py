@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,11 @@ _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 # Data types of functions whose unit no label tells: that of the set 164, and SI without one.
 _SPECIFIC = {8: "{length}", 9: "{force}", 11: "{length}/s", 12: "{length}/s²", 13: "{force}"}
-# Units by how many of them are an SI unit, as a set 164 states it.
-_LENGTHS = {1.0: "m", 100.0: "cm", 1000.0: "mm", 1 / units.INCH: "in", 1 / (12 * units.INCH): "ft"}
-_FORCES = {1.0: "N", 1000.0: "mN", 1e-3: "kN", 1 / units.POUND: "lbf"}
+# Units by how many of them are an SI unit, as a set 164 states it; SI without one, none where it has no name here.
+_SYSTEMS = {
+    "length": {1.0: "m", 100.0: "cm", 1000.0: "mm", 1 / units.INCH: "in", 1 / (12 * units.INCH): "ft"},
+    "force": {1.0: "N", 1000.0: "mN", 1e-3: "kN", 1 / units.POUND: "lbf"},
+}
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
 # A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
 _BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
@@ -46,7 +48,10 @@ def read_universal(path: Path) -> list[Recording]:
     sets = _sets(path)
     stated = next((one for one in sets if one.get("type") == 164), {})
     points = _points(sets, 1 / (stated.get("length") or 1.0))
-    file_units = _Units(_of_system(stated, "length", _LENGTHS), _of_system(stated, "force", _FORCES))
+    file_units = {
+        quantity: next((name for one, name in known.items() if abs((stated.get(quantity) or 1.0) / one - 1) < 1e-4), "")
+        for quantity, known in _SYSTEMS.items()
+    }
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
     used = [(at, one) for at, one in functions if one["func_type"] in _READ]
@@ -108,19 +113,6 @@ def _check_whole(path: Path, content: bytes) -> None:
         begin = _MARK.search(content, end.end())
 
 
-class _Units(NamedTuple):
-    """The file's units; "" where its set 164 states one that has no name here."""
-
-    length: str
-    force: str
-
-
-def _of_system(stated: dict[str, Any], quantity: str, known: dict[float, str]) -> str:
-    """The unit of a set 164, which states how many of it are an SI unit; the SI unit without such a set."""
-    size = float(stated.get(quantity) or 1.0)
-    return next((name for one, name in known.items() if abs(size / one - 1) < 1e-4), "")
-
-
 def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[float, ...]]:
     """Positions of the nodes, m."""
     return {
@@ -132,7 +124,7 @@ def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[fl
 
 
 def _recording(
-    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], file_units: _Units
+    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], file_units: dict[str, str]
 ) -> Recording:  # fmt: skip
     columns = tuple(_column(path, at, one, points, file_units) for at, one in run)
     first, lengths = run[0][1], {column.values.size for column in columns}
@@ -155,7 +147,7 @@ def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-6, atol=0))
 
 
-def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: _Units) -> Column:
+def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: dict[str, str]) -> Column:
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
     words = f"{values.size} of {one['num_pts']} values are there: it is cut short, or not of the precision that it says"
     refuse((values.size < one["num_pts"], f"{path}, set {at} ({name}): {words}; export it again"))
@@ -176,7 +168,7 @@ def dof(node: int, direction: int) -> str:
     return f"{int(node)}{'-' if int(direction) < 0 else '+'}{name}"
 
 
-def _unit(one: dict[str, Any], side: str, file_units: _Units) -> str:
+def _unit(one: dict[str, Any], side: str, file_units: dict[str, str]) -> str:
     """Unit of an axis: its label where that names a unit, else the file's unit of its data type, else ""."""
     for key in (f"{side}_axis_units_lab", f"{side}_axis_lab"):
         label = str(one.get(key, "")).strip().strip("[]()")
@@ -185,5 +177,5 @@ def _unit(one: dict[str, Any], side: str, file_units: _Units) -> str:
     label = str(one.get(f"{side}_axis_units_lab", "")).strip()
     if label not in _NO_LABEL:
         return label  # unknown: whoever takes the channel says so
-    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**file_units._asdict())
+    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**file_units)
     return unit * (units.find(unit) is not None)
