@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
@@ -11,20 +10,18 @@ import numpy as np
 from sysid.errors import shown_plainly
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
-from sysid.structure.structure import Array, Structure
+from sysid.structure.structure import Array, CraigBampton, Structure
 
 _UNITS = {"M": ("kg", "kg m", "kg m2"), "K": ("N/m", "N", "N m"), "C": ("N s/m", "N s", "N s m")}
 
 
-def damping_of(structure: Structure) -> Array:
-    """Damping on all degrees of freedom, (n + d, n + d): ``[I, -G]' C [I, -G]``, zero in a rigid-body motion."""
-    relative = np.hstack([np.eye(structure.n), -structure.rigid_body_dofs])
-    return relative.T @ structure.damping @ relative
-
-
 def matrices_of(structure: Structure) -> dict[str, Array]:
-    """M, K and C, (n + d, n + d) each, the structure's degrees of freedom first."""
-    return {"M": structure.mass, "K": structure.stiffness, "C": damping_of(structure)}
+    """M, K and C, (n + d, n + d) each, the structure's degrees of freedom first.
+
+    C is ``[I, -G]' C_SS [I, -G]``: zero in a rigid-body motion.
+    """
+    relative = np.hstack([np.eye(structure.n), -structure.rigid_body_dofs])
+    return {"M": structure.mass, "K": structure.stiffness, "C": relative.T @ structure.damping @ relative}
 
 
 def deviations_of(it: Identification) -> dict[str, Array]:
@@ -49,15 +46,10 @@ def entry_unit(letter: str, row: bool | None, column: bool | None) -> str:
 
 def rotations_of(it: Identification) -> tuple[bool | None, ...]:
     """Which rows of the matrices are rotations; None for a coordinate that no sensor records, which may be anything."""
-    turned = (None if j < 0 else _records_rotation(it, j) for j in it.structure.dof_sensors)
+    axes = [sensor.axis for sensor in it.measurement.sensors or ()] or [""] * it.structure.n_sensors
+    turns = [isinstance(axis, str) and "r" in axis for axis in axes]
+    turned = (turns[j] if j >= 0 else None for j in it.structure.dof_sensors)
     return (*turned, *(axis.startswith("r") for axis in it.measurement.base_axes or ()))
-
-
-def _records_rotation(it: Identification, sensor: int) -> bool:
-    """True where a sensor is described as one of rotation."""
-    sensors = it.measurement.sensors
-    axis = "" if sensors is None else sensors[sensor].axis
-    return isinstance(axis, str) and "r" in axis
 
 
 _WORTH = {
@@ -109,33 +101,13 @@ def one_line_each(texts: Sequence[str], width: int, mark: str = "") -> list[str]
     return [line for t in plain for line in textwrap.wrap(t, width, initial_indent=mark, subsequent_indent=mark + "  ")]
 
 
-@dataclass(frozen=True)
-class Superelement:
-    """A structure in base motions u_0 (d) and modal coordinates q (m), the base first.
+def superelement_of(structure: Structure) -> CraigBampton:
+    """`Structure.to_craig_bampton` with the base first: rows and columns are of [u_0; q], all modes kept.
 
-    Attributes
-    ----------
-    mass, stiffness, damping : (d + m, d + m)
-        ``[[M_rb, Gamma'], [Gamma, I]]``, ``diag(0, w²)`` and ``diag(0, 2 zeta w)``, the last not diagonal where damping
-        is not classical. No term is left out: the base is statically determinate, so that its constraint modes are the
-        rigid-body motions, which strain nothing, and all modes of the identified matrices are kept.
-    recovery : (n_sensors, d + m)
-        ``[G, Phi]``: takes [u_0; q] to the absolute motion of the sensors.
-
-    References
-    ----------
-    R. R. Craig, M. C. C. Bampton, AIAA J. 6 (1968) 1313-1319.
+    No term is left out: the base is statically determinate, so that its constraint modes are the rigid-body motions,
+    which strain nothing.
     """
-
-    mass: Array
-    stiffness: Array
-    damping: Array
-    recovery: Array
-
-
-def superelement_of(structure: Structure) -> Superelement:
-    """`Structure.to_craig_bampton` with the base first."""
     form, n = structure.to_craig_bampton(), structure.n
     order = np.r_[n : n + structure.n_base, :n]
     both = np.ix_(order, order)
-    return Superelement(form.mass[both], form.stiffness[both], form.damping[both], form.recovery[:, order])
+    return CraigBampton(form.mass[both], form.stiffness[both], form.damping[both], form.recovery[:, order])

@@ -2,35 +2,47 @@
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from sysid.errors import InputError, instance, needed, path_of
+from sysid.export.content import statements
+from sysid.export.other_programs import write_dmig, write_op4, write_uff55
+from sysid.export.tables import write_matlab, write_text
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format: its module of this room, its name, where its files say what they are worth, and what it needs."""
+    """A format, its writer, and what its files can hold."""
 
-    module: str
+    write: Callable[[Identification, tuple[str, ...], Path], None]  # of the sentences of the file too
     name: str
-    note: str
-    deviations: bool = False
-    needs: str = ""
+    note: str  # where its files say what they are worth
+    precision: str
+    deviations: bool = False  # whether it has a place for them
+    needs: str = ""  # a package, of the extra
     extra: str = ""
 
 
+_BYTES = "exact: the file holds the 8 bytes of each double-precision number"
+_DIGITS = "exact: each number has the up to 17 digits that give the same double-precision number when read"
+_FIELD = "10 significant digits: what 16 characters, the widest field of bulk data, hold beside sign and exponent"
+_DMIG = Format(write_dmig, "Nastran DMIG superelement", "its first lines", _FIELD)
+_MODES = Format(
+    write_uff55, "universal file of mode shapes", "its first lines",
+    "6 significant digits: dataset 55 prescribes the number format E13.5",
+)  # fmt: skip
 FORMATS = {
-    ".csv": Format("text_table", "table of M, K and C with deviations", "its first lines", deviations=True),
-    ".mat": Format("matlab", "MATLAB file", "its variable 'about'", deviations=True),
-    ".op4": Format("op4", "Nastran OUTPUT4 file", "its matrix NOTE", needs="pyyeti", extra="nastran"),
-    ".dmig": Format("dmig", "Nastran DMIG superelement", "its first lines"),
-    ".bdf": Format("dmig", "Nastran DMIG superelement", "its first lines"),
-    ".unv": Format("uff55", "universal file of mode shapes", "its first lines"),
-    ".uff": Format("uff55", "universal file of mode shapes", "its first lines"),
+    ".csv": Format(write_text, "table of M, K and C with deviations", "its first lines", _DIGITS, deviations=True),
+    ".mat": Format(write_matlab, "MATLAB file", "its variable 'about'", _BYTES, deviations=True),
+    ".op4": Format(write_op4, "Nastran OUTPUT4 file", "its matrix NOTE", _BYTES, needs="pyyeti", extra="nastran"),
+    ".dmig": _DMIG,
+    ".bdf": _DMIG,
+    ".unv": _MODES,
+    ".uff": _MODES,
 }
 
 
@@ -71,9 +83,8 @@ def export(identification: Identification, path: str | Path) -> Path:
     chosen = format_of(target)
     if chosen.needs:
         needed(chosen.needs, chosen.extra, f"{target}: a {chosen.name}")
-    module = importlib.import_module(f"sysid.export.{chosen.module}")
     with atomically(target) as temporary:
-        getattr(module, f"write_{chosen.module}")(identification, temporary)
+        chosen.write(identification, statements(identification, chosen.precision), temporary)
     return target
 
 
@@ -84,9 +95,3 @@ def format_of(path: Path) -> Format:
         known = ", ".join(f"{ending} ({form.name})" for ending, form in FORMATS.items())
         raise InputError(f"{path}: no format has the ending {path.suffix!r}; there are {known}")
     return found
-
-
-def precision(path: str | Path) -> str:
-    """Precision of the numbers in a file of this ending, in words."""
-    found = importlib.import_module(f"sysid.export.{format_of(Path(path)).module}")
-    return str(found.PRECISION)

@@ -10,15 +10,18 @@ import numpy as np
 
 from sysid.errors import InputError, refuse
 from sysid.files import units
-from sysid.files.description import Channel, Description
+from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_column, rate_of
-from sysid.files.spectral import TIME_NAMES, is_abscissa
+from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
 _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
-_TURNS = {True: ("angular acceleration",), False: ("acceleration",)}
+# What a sensor records in time, by whether it is of a force and of a rotation.
+_QUANTITIES = {
+    (False, False): "acceleration", (False, True): "angular acceleration",
+    (True, False): "force", (True, True): "moment",
+}  # fmt: skip
 
 
 def assembled_in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
@@ -29,18 +32,17 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     InputError
         Where roles or axes are not said, a column or a rate is missing, a unit is unknown or of something else.
     """
-    refuse((not said.channels, undescribed(recordings[0])))
-    said, remarks = completed(said, recordings[0])
+    said, remarks = described(recordings, said)
     axes = base_directions(said)
     runs, table, rates = [], [], []
     for recording in recordings:
         rates.append(_rate(recording, said))
         records, rows = _records(recording, said)
         table += rows
-        remarks += [f"{recording.path}: {remark}" for remark in recording.remarks]
-        plain = [column for column in (_time_column(recording, said),) if column is not None and not column.unit]
+        plain = [column for column in _time_columns(recording, said) if not column.unit]
         remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
-        runs.append(_run(records, said, axes, recording))
+        parts = list(zip(said.channels, records, strict=True))
+        runs.append(run_of(parts, said, axes, str(recording.path)))
     if max(rates) - min(rates) > 1e-6 * max(rates):
         raise InputError(
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
@@ -58,35 +60,30 @@ def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
     return [(base, base, force) for base, force in spectra], np.fft.rfftfreq(n, 1 / rate)[1:-1]
 
 
-def undescribed(recording: Recording) -> str:
-    """Message where nothing tells which column is which sensor."""
-    return (
-        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file "
-        "(--sensors FILE.toml), or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid "
-        "read --help' shows such a file"
-    )
-
-
-def completed(said: Description, recording: Recording) -> tuple[Description, list[str]]:
-    """The description with axes and positions that the file tells and it does not, and what is to be told of that.
+def described(recordings: Sequence[Recording], said: Description) -> tuple[Description, list[str]]:
+    """The description with axes and positions that the first file tells and it does not, and all remarks so far.
 
     Raises
     ------
     InputError
-        A column that is missing; an axis that neither tells; a sensor without position on a base that turns.
+        Nothing is said of the channels; a column that is missing; an axis that neither tells; a sensor without position
+        on a base that turns.
     """
+    recording = recordings[0]
+    words = (
+        f"which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file (--sensors FILE.toml)"
+    )
+    words += ", or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid read --help' shows "
+    refuse((not said.channels, f"{recording.path}: {words}such a file"))
     channels, remarks = [], []
     for at, channel in enumerate(said.channels, 1):
         named = [column for column in recording.columns if column.name == str(channel.column)]
         column = named[0] if named else recording.column(channel.column)
         axis = channel.axis or column.axis
-        refuse(
-            (
-                not axis,
-                f"{said.place}, sensor {at} (column {channel.column}): axis is missing, and {recording.path} does not "
-                "tell it: x, y, z, a sign before it where it points back, or a vector",
-            )
+        words = (
+            f"axis is missing, and {recording.path} does not tell it: x, y, z, a sign before it where it points back"
         )
+        refuse((not axis, f"{said.place}, sensor {at} (column {channel.column}): {words}, or a vector"))
         other = column.axis and isinstance(axis, str) and axis.lstrip("+") != column.axis
         conflict = f"the file says axis {column.axis}, the description {axis}, which is taken"
         remarks += [f"{recording.path}, {column.place}: {conflict}"] * bool(other)
@@ -97,6 +94,7 @@ def completed(said: Description, recording: Recording) -> tuple[Description, lis
     lost = next((one.name for one in channels if turns and one.role == "response" and one.position is None), None)
     refuse((lost, f"{said.place}: the base turns, and the position of {lost!r} is missing: position, in m"))
     placed = [replace(one, position=one.position or (0.0, 0.0, 0.0)) for one in channels]
+    remarks += [f"{one.path}: {remark}" for one in recordings for remark in one.remarks]
     return replace(said, channels=tuple(placed)), remarks
 
 
@@ -107,15 +105,17 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
     return tuple(Sensor(name, points[name], channel.axis) for name, channel in found.items())
 
 
-def base_directions(said: Description) -> tuple[str, ...]:
-    """Names of the base's directions: stated, or those of the base channels."""
+def base_directions(said: Description, channels_needed: bool = True) -> tuple[str, ...]:
+    """Names of the base's directions: stated, or those of the base channels, which functions per base motion lack."""
     base = [channel for channel in said.channels if channel.role == "base"]
+    along = (
+        'along which axes does the base move? State base_axes, such as "x" (--base-axes x), or the base\'s own channels'
+    )
+    absent = not any(channel.role == "response" for channel in said.channels)
     refuse(
-        (not base, f'{said.place}: no sensor has role = "base": the motion of the table is needed'),
-        (
-            not any(channel.role == "response" for channel in said.channels),
-            f'{said.place}: no sensor has role = "response": a sensor on the structure is needed',
-        ),
+        (channels_needed and not base, f'{said.place}: no sensor has role = "base": the motion of the table is needed'),
+        (not base and said.base_axes is None, f"{said.place}: {along}"),
+        (absent, f'{said.place}: no sensor has role = "response": a sensor on the structure is needed'),
     )
     if said.base_axes is not None:
         return tuple(BASE_AXES[column] for column in base_columns(said.base_axes))
@@ -126,7 +126,8 @@ def base_directions(said: Description) -> tuple[str, ...]:
 
 
 def _rate(recording: Recording, said: Description) -> float:
-    column = _time_column(recording, said)
+    """Samples a second, Hz: by the column of time, else stated or of the file."""
+    column = next(iter(_time_columns(recording, said)), None)
     if column is None:
         rate = said.sample_rate or recording.sample_rate
         if rate is None:
@@ -135,31 +136,25 @@ def _rate(recording: Recording, said: Description) -> float:
                 f"Hz (--time, --rate); {recording.in_words()}"
             )
         return rate
-    known = units.find(column.unit) if column.unit else units.UNITS["s"]
+    place, known = f"{recording.path}, {column.place}", units.find(column.unit or "s")
     if known is None or known.quantity != "time":
-        raise InputError(f"{recording.path}, {column.place}: time in {column.unit!r} is not understood: s, ms, us are")
+        raise InputError(f"{place}: time in {column.unit!r} is not understood: s, ms, us are")
     check_column(column, recording.path)
     rate = rate_of(np.real(column.values) * known.factor, recording.path, column.place)
-    if said.sample_rate is not None and abs(rate / said.sample_rate - 1) > 0.01:
-        raise InputError(
-            f"{recording.path}, {column.place}: time tells {rate:g} Hz and sample_rate {said.sample_rate:g} Hz; is "
-            "time in another unit than s? State one of them"
-        )
-    return said.sample_rate or _round(rate, column.values.size)
+    stated = said.sample_rate or rate
+    words = f"time tells {rate:g} Hz and sample_rate {stated:g} Hz; is time in another unit than s? State one of them"
+    refuse((abs(rate / stated - 1) > 0.01, f"{place}: {words}"))
+    near = float(f"{rate:.6g}")  # without what rounding of the times in a file adds to it
+    return said.sample_rate or (near if abs(near / rate - 1) * column.values.size < 0.05 else rate)
 
 
-def _round(rate: float, samples: int) -> float:
-    """The rate without what rounding of the times in a file adds to it."""
-    near = float(f"{rate:.6g}")
-    return near if abs(near / rate - 1) * samples < 0.05 else rate
-
-
-def _time_column(recording: Recording, said: Description) -> Column | None:
+def _time_columns(recording: Recording, said: Description) -> list[Column]:
+    """The column of time, stated or named so; none where there are several, or a rate is stated."""
     if said.time is not None:
-        return recording.column(said.time)
+        return [recording.column(said.time)]
     used = {str(channel.column) for channel in said.channels}
-    found = [column for column in recording.columns if column.name.lower() in TIME_NAMES and column.name not in used]
-    return found[0] if len(found) == 1 and said.sample_rate is None else None
+    found = [column for column in recording.columns if is_time(column.name) and column.name not in used]
+    return found if len(found) == 1 and said.sample_rate is None else []
 
 
 def _records(recording: Recording, said: Description) -> tuple[list[Array], list[ChannelRow]]:
@@ -172,11 +167,8 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
         factor, unit = _factor(recording, column, channel)
         record = factor * np.real(column.values)
         rms = float(np.std(record))
-        if channel.role != "force" and rms == 0.0:
-            raise InputError(
-                f"{recording.path}, {column.place}: the record of {channel.name!r} never moves: is it the right "
-                "column? Else leave it out"
-            )
+        words = f"the record of {channel.name!r} never moves: is it the right column? Else leave it out"
+        refuse((channel.role != "force" and rms == 0.0, f"{recording.path}, {column.place}: {words}"))
         records.append(record)
         rows.append(row_of(column, channel, unit, factor, rms, recording))
     return records, rows
@@ -191,56 +183,59 @@ def row_of(column: Column, channel: Channel, unit: str, factor: float, rms: floa
 def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[float, str]:
     """Factor of a channel to SI, and its unit; what is said and what stands in the file must agree."""
     place = f"{recording.path}, {column.place}"
-    in_file = units.find(column.unit) if column.unit else None
     text = channel.unit or column.unit
-    if not text:
-        raise InputError(f'{place}: no unit is stated: add unit = "g", "m/s²", "N" or the like to the sensor')
+    refuse((not text, f'{place}: no unit is stated: add unit = "g", "m/s²", "N" or the like to the sensor'))
     known = units.unit(text, place)
-    if channel.unit and in_file is not None and in_file != known:
-        raise InputError(
-            f"{place}: the file says {column.unit!r} and the description {channel.unit!r}: mend one of them, or leave "
-            "unit out of the description"
-        )
-    turns = isinstance(channel.axis, str) and "r" in channel.axis
-    wanted = ("moment" if turns else "force") if channel.role == "force" else _TURNS[turns][0]
-    if known.quantity != wanted:
-        raise InputError(
-            f"{place}: {text!r} is a {known.quantity}, and a {channel.role} sensor along {channel.axis} gives "
-            f"a {wanted}{'; sysid takes accelerations in time' if channel.role != 'force' else ''}"
-        )
+    force, turns = channel.role == "force", isinstance(channel.axis, str) and "r" in channel.axis
+    wanted = _QUANTITIES[force, turns]
+    unlike = (
+        f"the file says {column.unit!r} and the description {channel.unit!r}: mend one of them, or leave unit out of"
+    )
+    words = f"{text!r} is a {known.quantity}, and a {channel.role} sensor along {channel.axis} gives a {wanted}"
+    refuse(
+        (units.find(column.unit) not in (None, known), f"{place}: {unlike} the description"),
+        (known.quantity != wanted, f"{place}: {words}{'; sysid takes accelerations in time' * (not force)}"),
+    )
     return known.factor, text
 
 
-def motions(channels: Sequence[Channel], axes: Sequence[str], origin: Sequence[float]) -> Array:
-    """Readings of channels at unit motions of the base in its directions, (channels, d)."""
-    points = np.array([channel.position or (0.0, 0.0, 0.0) for channel in channels])
-    rows = rigid_motion(points, origin).reshape(len(points), 6, 6)
-    ways = [sensor_row(channel.axis, channel.name) for channel in channels]
-    return np.array([way @ row for way, row in zip(ways, rows, strict=True)])[:, base_columns(list(axes))]
+def run_of(
+    parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str, moved: Any = None
+) -> Run:
+    """A run of channels with their records or spectra in SI units: base point, sensors, total force.
+
+    `moved` (d, n) is the motion of the base point where no channel has it.
+    """
+    base, response, force = ([part for part in parts if part[0].role == role] for role in ROLES)
+    named = {channel.name: values for channel, values in response}
+    responses = np.array([named[sensor.name] for sensor in sensors_of(said)])
+    motion = moved if moved is not None else _base_motion(base, said, axes, place)
+    return motion, responses, _total_force(force, said, axes, place) if force else None
 
 
-def base_motion(
-    channels: Sequence[Channel], said: Description, axes: Sequence[str], base: Array, place: str
-) -> Array:  # fmt: skip
+def _base_motion(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """Motion of the base point from its sensors by least squares, (d, n)."""
-    seen = motions([channel for channel in channels if channel.role == "base"], axes, said.origin)
-    if np.linalg.matrix_rank(seen) < len(axes):
-        raise InputError(
-            f"{place}: the base's sensors do not show its motion along {' '.join(axes)}: each direction needs one"
-        )
-    return base if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ base
+    seen, values = _motions(parts, said, axes), np.array([values for _, values in parts])
+    shown = np.linalg.matrix_rank(seen) == len(axes)
+    words = "the base's sensors do not show its motion along"
+    refuse((not shown, f"{place}: {words} {' '.join(axes)}: each direction needs one"))
+    return values if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ values
 
 
-def total_force(
-    channels: Sequence[Channel], said: Description, axes: Sequence[str], force: Sequence[Array], place: str
-) -> Array | None:
-    """The sum of the load cells along the base's directions, (d, n); None without any."""
-    if not force:
-        return None
-    cells = motions([channel for channel in channels if channel.role == "force"], axes, said.origin)
+def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
+    """The sum of the load cells along the base's directions, (d, n)."""
+    cells = _motions(parts, said, axes)
     unseen = [axis for axis, column in zip(axes, cells.T, strict=True) if not np.any(column)]
     refuse((unseen, f"{place}: no force sensor acts along {' '.join(unseen)}: measure it there too, or give no force"))
-    return cells.T @ np.array(force)
+    return cells.T @ np.array([values for _, values in parts])
+
+
+def _motions(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str]) -> Array:
+    """Readings of channels at unit motions of the base in its directions, (channels, d)."""
+    points = np.array([channel.position or (0.0, 0.0, 0.0) for channel, _ in parts])
+    rows = rigid_motion(points, said.origin).reshape(len(points), 6, 6)
+    ways = [sensor_row(channel.axis, channel.name) for channel, _ in parts]
+    return np.array([way @ row for way, row in zip(ways, rows, strict=True)])[:, base_columns(list(axes))]
 
 
 def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
@@ -256,28 +251,11 @@ def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
     return [right] * (share > _CLEAR_POWER) + [reversed_] * (share < -_CLEAR_POWER)
 
 
-def _run(records: list[Array], said: Description, axes: Sequence[str], recording: Recording) -> Run:
-    by_role = {
-        role: [record for record, channel in zip(records, said.channels, strict=True) if channel.role == role]
-        for role in ("base", "response", "force")
-    }
-    place = str(recording.path)
-    base = base_motion(said.channels, said, axes, np.array(by_role["base"]), place)
-    return base, np.array(by_role["response"]), total_force(said.channels, said, axes, by_role["force"], place)
-
-
-_SHORTER = 0.01  # of its samples by which a file may be shorter than another
-
-
 def by_folder(recordings: Sequence[Recording], said: Description) -> list[Recording]:
     """The recordings of each folder as one, in the order of the folders.
 
-    A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency.
-
-    Raises
-    ------
-    InputError
-        Files of other times or rates, or much longer than others.
+    A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency. Refused are
+    files of other times or rates, or longer than others by more than a hundredth.
     """
     folders = dict.fromkeys(recording.path.parent for recording in recordings)
     return [_together([one for one in recordings if one.path.parent == folder], said) for folder in folders]
@@ -285,14 +263,13 @@ def by_folder(recordings: Sequence[Recording], said: Description) -> list[Record
 
 def _together(recordings: Sequence[Recording], said: Description) -> Recording:
     first = recordings[0]
-    shared = _abscissa(first, said)
     lengths = [recording.columns[0].values.size for recording in recordings]
     n = min(lengths)
-    columns = [replace(one, values=one.values[:n]) for one in (shared,) if one is not None]
+    columns = [replace(one, values=one.values[:n]) for one in _abscissa(first, said)]
     for recording in recordings:
         _check_same(first, recording, said, n, max(lengths))
-        abscissa = _abscissa(recording, said)
-        others = [column for column in recording.columns if column is not abscissa]
+        shared = [id(column) for column in _abscissa(recording, said)]
+        others = [column for column in recording.columns if id(column) not in shared]
         for column in others:
             stem = recording.path.stem
             name = stem if len(others) == 1 else f"{stem}.{column.name}"
@@ -304,33 +281,24 @@ def _together(recordings: Sequence[Recording], said: Description) -> Recording:
     return Recording(first.path, tuple(columns), first.sample_rate, first.freq, tuple(remarks))
 
 
-def _abscissa(recording: Recording, said: Description) -> Column | None:
-    """Time or frequency of a file."""
-    named = said.time if said.time is not None else said.frequency
-    if named is not None:
-        return recording.column(named)
-    return next((column for column in recording.columns if is_abscissa(column.name)), None)
+def _abscissa(recording: Recording, said: Description) -> list[Column]:
+    """The column of time or frequency of a file, stated or the first named so; none where there is none."""
+    stated = [recording.column(name) for name in (said.time, said.frequency) if name is not None]
+    return (stated or [column for column in recording.columns if is_abscissa(column.name)])[:1]
 
 
 def _check_same(first: Recording, other: Recording, said: Description, n: int, longest: int) -> None:
-    a, b = _abscissa(first, said), _abscissa(other, said)
+    abscissas = _abscissa(first, said), _abscissa(other, said)
     size = other.columns[0].values.size
     together = "are these files of one run, on one clock? Else read them apart, or bring them to it with sysid.resample"
+    alike = f"{other.path}, beside {first.path}: one has a column of time or frequency, one has none"
+    rates = f"{other.path} has another sample rate than {first.path}: {together}"
     refuse(
-        (
-            longest - size > _SHORTER * longest,
-            f"{other.path} has {size} samples, another file {longest}: {together}",
-        ),
-        (
-            (a is None) != (b is None),
-            f"{other.path}, beside {first.path}: one has a column of time or frequency, one has none",
-        ),
-        (
-            first.sample_rate != other.sample_rate,
-            f"{other.path} has another sample rate than {first.path}: {together}",
-        ),
+        (longest - size > 0.01 * longest, f"{other.path} has {size} samples, another file {longest}: {together}"),
+        (len(abscissas[0]) != len(abscissas[1]), alike),
+        (first.sample_rate != other.sample_rate, rates),
     )
-    if a is not None and b is not None:
+    for a, b in zip(*abscissas, strict=True):
         step = float(np.median(np.abs(np.diff(np.real(a.values)))))
         off = np.abs(np.real(a.values[:n]) - np.real(b.values[:n])) > 0.01 * step
         at = int(np.argmax(off))

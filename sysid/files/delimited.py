@@ -13,8 +13,7 @@ import numpy as np
 
 from sysid.errors import InputError, shown
 from sysid.files import units
-from sysid.files.recording import Column, Recording
-from sysid.files.spectral import part_of
+from sysid.files.recording import Column, Recording, part_of
 from sysid.structure.structure import Array
 
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")
@@ -57,13 +56,10 @@ def _number(field: str) -> complex | None:
     return None
 
 
-def read_delimited(path: Path) -> Recording:
+def read_delimited(path: Path) -> list[Recording]:
     """Columns of a text table; a last line that was cut short is left out, and said.
 
-    Raises
-    ------
-    InputError
-        A file without a table, a line in the middle with another number of fields or a word, a second table.
+    Refused is a file without a table, a line in the middle with another number of fields or a word, a second table.
     """
     lines = _text(path).splitlines()
     form, width = _form(lines, path)
@@ -71,7 +67,10 @@ def read_delimited(path: Path) -> Recording:
     first = next(
         at for at, (_, row) in enumerate(rows) if len(row) == width and any(row) and form.numbers(row) is not None
     )
-    body, remarks = _whole(rows[first:], form, width)
+    body, remarks = rows[first:], []
+    number, last = body[-1]
+    if len(body) > 1 and (len(last) < width or form.numbers(last) is None):
+        body, remarks = body[:-1], [f"line {number}, the last, is cut short and left out"]
     table = _numbers(body, form, width, path)
     values = [column if np.any(column.imag) else column.real for column in table.T]
     names, given = _header([row for _, row in rows[:first]], width)
@@ -80,7 +79,7 @@ def read_delimited(path: Path) -> Recording:
         Column(names[at] or f"column {at + 1}", values[at], given[at], f"column {at + 1} ({names[at] or 'no name'})")
         for at in kept
     )
-    return Recording(path, columns, remarks=remarks)
+    return [Recording(path, columns, remarks=tuple(remarks))]
 
 
 def _text(path: Path) -> str:
@@ -90,10 +89,9 @@ def _text(path: Path) -> str:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
     if not content.strip():
         raise InputError(f"{path} is empty")
-    if content.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):  # begins as UTF-16 does
-        return content.decode("utf-32", "replace")
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", "replace")
+    for size in (32, 16):  # in this order: the longer mark begins as the shorter one
+        if content.startswith(tuple(getattr(codecs, f"BOM_UTF{size}_{order}") for order in ("LE", "BE"))):
+            return content.decode(f"utf-{size}", "replace")
     head = content[:4000]
     if head.count(0) > len(head) // 4:  # Latin letters in UTF-16 without its mark: every other byte is zero
         return content.decode("utf-16-le" if head[1::2].count(0) > head[::2].count(0) else "utf-16-be", "replace")
@@ -123,16 +121,6 @@ def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[_Form, in
         found = f"{shown(line)} stands in its middle" if line.isprintable() else "it is no text"
         raise InputError(f"{path} holds no table of numbers: {found}; export it as text, a row a sample")
     return best
-
-
-def _whole(
-    body: list[tuple[int, list[str]]], form: _Form, width: int
-) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
-    """The rows without a last one that was cut short."""
-    number, last = body[-1]
-    if len(body) > 1 and (len(last) < width or form.numbers(last) is None):
-        return body[:-1], (f"line {number}, the last, is cut short and left out",)
-    return body, ()
 
 
 def _numbers(body: list[tuple[int, list[str]]], form: _Form, width: int, path: Path) -> Array:

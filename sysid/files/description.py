@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ class Description:
     frf: str = ""
     convention: str = ""
     join: bool = False
-    place: str = field(default="the description")
+    place: str = "the description"
 
 
 def from_toml(path: Path) -> dict[str, Any]:
@@ -107,13 +107,7 @@ def from_words(words: Sequence[str]) -> dict[str, Any]:
 
 
 def description(given: Mapping[str, Any], place: str = "the description") -> Description:
-    """Check what is said of a test.
-
-    Raises
-    ------
-    InputError
-        A word that is not known, a role, an axis or a position that is none.
-    """
+    """The description of a mapping; refused is a word that is not known, a role, an axis or a position that is none."""
     for name in given:
         refuse((name not in _TOP, f"{place}: {name!r} is unknown; known are {', '.join(_TOP)}"))
     listed = given.get("sensor", ())
@@ -121,12 +115,14 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         _channel(entry, f"{place}, sensor {at}")
         for at, entry in enumerate(listed and sequence(f"{place}: sensor", listed, "a list of sensors"), 1)
     )
-    columns = [channel.column for channel in channels if not channel.reference]
+    own = [channel for channel in channels if not channel.reference]
+    columns, names = [one.column for one in own], [one.name for one in own if one.role == "response"]
     twice = next((one for one in columns if columns.count(one) > 1), None)
-    refuse((twice is not None, f"{place}: column {twice!r} is given to two sensors"))
-    names = [channel.name for channel in channels if channel.role == "response" and not channel.reference]
-    twice = next((one for one in names if names.count(one) > 1), None)
-    refuse((twice is not None, f"{place}: two sensors of the responses are named {twice!r}: name them apart"))
+    alike = next((one for one in names if names.count(one) > 1), None)
+    refuse(
+        (twice is not None, f"{place}: column {twice!r} is given to two sensors"),
+        (alike is not None, f"{place}: two sensors of the responses are named {alike!r}: name them apart"),
+    )
     rate, axes, convention = given.get("sample_rate"), given.get("base_axes"), given.get("convention", "")
     if axes is not None:
         base_columns(axes)
@@ -166,10 +162,7 @@ def _channel(entry: Any, place: str) -> Channel:
 
 def description_file(path: Path) -> Path | None:
     """A TOML file that stands beside a file: of its name, or ``sensors.toml`` in its folder."""
-    for near in (path.with_suffix(".toml"), path.parent / "sensors.toml"):
-        if near.is_file():
-            return near
-    return None
+    return next((near for near in (path.with_suffix(".toml"), path.parent / "sensors.toml") if near.is_file()), None)
 
 
 def asked(given: Any, paths: Sequence[Path]) -> Description:

@@ -7,20 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, path_of, refuse
-from sysid.files import arrays, assembly, delimited, responses, spectral, universal, xsens_dot
+from sysid.files import arrays, assembly, delimited, responses, universal, xsens_dot
 from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
-from sysid.files.recording import Recording
+from sysid.files.recording import Recording, recognised
 from sysid.measurement.measurement import Measurement
 
-_READERS: dict[str, Callable[[Path], Recording]] = {
+_TEXT = (".csv", ".txt", ".tsv", ".asc", ".dat")
+_UNIVERSAL = (".uff", ".unv", ".ufb")
+_READERS: dict[str, Callable[[Path], list[Recording]]] = {
+    **dict.fromkeys(_TEXT, delimited.read_delimited),
     ".npz": arrays.read_npz,
     ".mat": arrays.read_mat,
     **dict.fromkeys((".h5", ".hdf5"), arrays.read_hdf5),
+    **dict.fromkeys(_UNIVERSAL, universal.read_universal),
 }
-_UNIVERSAL = (".uff", ".unv", ".ufb")
-_LONGEST = 2**30  # bytes of a text
-_TEXT = (".csv", ".txt", ".tsv", ".asc", ".dat")
 
 
 def read(
@@ -65,10 +66,9 @@ _BEGINNINGS = (
 def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> RecordedTest:
     """The test of some files, with its records whole; arguments as of `read`."""
     files = [path_of("paths", path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
-    if not files:
-        raise InputError("paths is empty: give the files of a test")
+    refuse((not files, "paths is empty: give the files of a test"))
     for file in files:
-        _check_ordinary(file)
+        _check_file(file)
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
         return assembly.assembled_in_time([xsens_dot.together(files)], said)  # a unit is a file
@@ -77,52 +77,25 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         recordings = assembly.by_folder(recordings, said)
     else:
         _check_one_each(recordings, said)
-    recordings = [spectral.recognised(recording, said) for recording in recordings]
+    recordings = [recognised(recording, said) for recording in recordings]
     spectra = {recording.freq is not None for recording in recordings}
-    if len(spectra) > 1:
-        raise InputError("some files hold records in time and some spectra: read them apart")
+    refuse((len(spectra) > 1, "some files hold records in time and some spectra: read them apart"))
     return responses.from_spectra(recordings, said) if spectra.pop() else assembly.assembled_in_time(recordings, said)
 
 
-def _recordings(file: Path) -> list[Recording]:
-    if not file.exists():
-        raise InputError(f"{file}: there is no such file")
-    if file.is_dir():
-        raise InputError(f"{file} is a folder: name its files")
-    ending = file.suffix.lower()
-    _check_ending(file, ending)
-    if ending in _UNIVERSAL:
-        return universal.read_universal(file)
-    if ending in _TEXT:
-        return [delimited.read_delimited(file)]
-    if ending not in _READERS:
-        known = ", ".join((*_TEXT, *_READERS, *_UNIVERSAL))
-        raise InputError(f"{file}: the ending {ending!r} is not known; known are {known}")
-    return [_READERS[ending](file)]
-
-
-def _check_ordinary(file: Path) -> None:
-    """Refuse a device or a pipe, which may never end, and a text that would take all memory."""
-    if not file.is_file():
-        refuse((file.exists() and not file.is_dir(), f"{file} is no file: a device or a pipe is not read"))
-        return
-    size = file.stat().st_size
+def _check_file(file: Path) -> None:
+    """Refuse what is no file, a device or a pipe, which may never end, and a text that would take all memory."""
     refuse(
-        (
-            file.suffix.lower() in _TEXT and size > _LONGEST,
-            f"{file} has {size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, "
-            ".h5 or .npz, or fewer channels or minutes a file",
-        ),
+        (not file.exists(), f"{file}: there is no such file"),
+        (file.is_dir(), f"{file} is a folder: name its files"),
+        (not file.is_file(), f"{file} is no file: a device or a pipe is not read"),
     )
-
-
-def _check_ending(file: Path, ending: str) -> None:
-    """Refuse a file that begins as one of another format than its ending says."""
-    with file.open("rb") as opened:
-        begin = opened.read(20)
-    for first, name, right, endings in _BEGINNINGS:
-        wrong = begin.startswith(first) and ending not in endings
-        refuse((wrong, f"{file} begins as a file of the format {name} does: give it the ending {right}"))
+    size = file.stat().st_size
+    words = (
+        f"{size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, .h5 or .npz,"
+    )
+    long = file.suffix.lower() in _TEXT and size > 2**30
+    refuse((long, f"{file} has {words} or fewer channels or minutes a file"))
 
 
 def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
@@ -131,19 +104,23 @@ def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
     others = {name: other.path for other in recordings[1:] for name in (*other.names, other.path.stem)}
     elsewhere = [str(channel.column) for channel in said.channels if str(channel.column) not in names]
     found = next((name for name in elsewhere if name in others), None)
-    refuse(
-        (
-            found is not None,
-            f"{recordings[0].path} has no column {found!r}, which {others.get(str(found))} is or has: does each file "
-            "hold one sensor? Then read them with --join (join = true)",
-        )
+    words = (
+        f"no column {found!r}, which {others.get(str(found))} is or has: does each file hold one sensor? Then read them"
     )
+    refuse((found is not None, f"{recordings[0].path} has {words} with --join (join = true)"))
 
 
 def _read_any(file: Path) -> list[Recording]:
     """The recordings of a file of any kind; what a library raises of a file that it cannot take is one line."""
+    ending, known = file.suffix.lower(), ", ".join(_READERS)
+    refuse((ending not in _READERS, f"{file}: the ending {ending!r} is not known; known are {known}"))
     try:
-        return _recordings(file)
+        with file.open("rb") as opened:
+            begin = opened.read(20)
+        for first, name, right, endings in _BEGINNINGS:
+            other = begin.startswith(first) and ending not in endings
+            refuse((other, f"{file} begins as a file of the format {name} does: give it the ending {right}"))
+        return _READERS[ending](file)
     except InputError:
         raise
     except MemoryError:

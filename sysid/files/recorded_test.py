@@ -25,19 +25,7 @@ Run = tuple[Array, Array, Array | None]
 
 @dataclass(frozen=True)
 class ChannelRow:
-    """One channel in the table of what was read.
-
-    Attributes
-    ----------
-    column, sensor, role, axis, unit : str
-        `unit` is the file's.
-    factor : float
-        By which its numbers were multiplied to be in SI units.
-    rms : float
-        In SI units, without the mean of a record in time.
-    source : str
-        File.
-    """
+    """One channel in the table of what was read; `unit`, `factor` to SI are the file's, `rms` is SI, without a mean."""
 
     column: str
     sensor: str
@@ -62,11 +50,9 @@ class RecordedTest:
     base_axes : tuple of str
     origin : tuple of float
         The base point, m.
-    sample_rate : float or None
-        Hz, of records in time.
-    freq : (n,) or None
-        Hz, of spectra.
-    table : tuple of Row
+    sample_rate, freq : float or None, (n,) or None
+        Hz: one of both, of records in time or of spectra.
+    table : tuple of ChannelRow
         Of all channels, file by file.
     remarks : tuple of str
         What was left out, recognised or mended.

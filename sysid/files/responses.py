@@ -14,20 +14,10 @@ import numpy as np
 
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
-from sysid.files.assembly import (
-    base_directions,
-    base_motion,
-    completed,
-    row_of,
-    sensors_of,
-    total_force,
-    undescribed,
-    work_of_force,
-)
+from sysid.files.assembly import base_directions, described, row_of, run_of, sensors_of, work_of_force
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column
-from sysid.structure.sensor import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray
 
 # Quantity of the numerator and of the denominator; that of a transmissibility is one and the same.
@@ -43,7 +33,6 @@ _ORDER = {"displacement": 2, "velocity": 1}  # how often to differentiate
 _OF_ROLE = {"base": "a motion", "response": "a motion", "force": "a force"}
 _MOTIONS = ("acceleration", "velocity", "displacement", "angular acceleration")
 _ENDS_WITH_AXIS = re.compile(r"(?:.*\d)?([+-]?)(r?[xyz])")
-_CLEAR = 0.02  # of the sums by which the convention is told
 
 
 def from_spectra(recordings: Sequence[Recording], said: Description) -> RecordedTest:
@@ -54,18 +43,16 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
     InputError
         Where form or convention are neither said nor shown, roles or axes are not said, a reference is missing.
     """
-    refuse((not said.channels, undescribed(recordings[0])))
+    said, remarks = described(recordings, said)
     if said.frf != "":
         choice(f"{said.place}: frf", said.frf, tuple(FORMS))
     freq = recordings[0].freq
     assert freq is not None
-    said, remarks = completed(said, recordings[0])
-    axes = base_directions_of(said)
+    axes = base_directions(said, channels_needed=False)
     for recording in recordings:
         other = recording.freq
         if other is None or other.shape != freq.shape or not np.allclose(other, freq, rtol=1e-6):
             raise InputError(f"{recording.path} has other lines than {recordings[0].path}: read them apart")
-        remarks += [f"{recording.path}: {remark}" for remark in recording.remarks]
     runs, table = _runs(recordings, said, axes, freq)
     sign, how = _convention(runs, said)
     if sign < 0:  # conjugated as they are in the file: velocities and displacements are differentiated after it
@@ -89,18 +76,6 @@ def _runs(
             runs.append(run)
             table += rows
     return runs, table
-
-
-def base_directions_of(said: Description) -> tuple[str, ...]:
-    """Directions of the base; where functions are per unit base motion its channel may be absent."""
-    if any(channel.role == "base" for channel in said.channels):
-        return base_directions(said)
-    if said.base_axes is None:
-        raise InputError(
-            f'{said.place}: along which axes does the base move? State base_axes, such as "x" (--base-axes x), or the '
-            "base's own channels"
-        )
-    return tuple(BASE_AXES[column] for column in base_columns(said.base_axes))
 
 
 def _is_used(column: Column, said: Description) -> bool:
@@ -127,43 +102,39 @@ def _run(
     ]
     forms = [_form(recording, column, channel, said) for channel, column in found]
     lower = _denominator(forms, reference, recording)
-    parts: dict[str, dict[str, ComplexArray]] = {"base": {}, "response": {}, "force": {}}
+    parts: list[tuple[Channel, ComplexArray]] = []
     rows: list[ChannelRow] = []
     for (channel, column), form in zip(found, forms, strict=True):
         check_column(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor
         values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
-        parts[channel.role][channel.name] = values
+        parts.append((channel, values))
         rms = float(np.sqrt(np.mean(np.abs(values) ** 2)))
         rows.append(row_of(column, channel, form.unit, form.factor, rms, recording))
-    sensors = [sensor.name for sensor in sensors_of(said)]
-    _check_responses(parts["response"], sensors, reference, recording)
-    response: Any = np.array([parts["response"][name] for name in sensors])
-    channels, place = [channel for channel, _ in found], str(recording.path)
-    base: Any = np.array(list(parts["base"].values()))
-    force: list[Any] = list(parts["force"].values())
-    if base.size:
-        base = base_motion(channels, said, axes, base, place)
-    else:
-        base = _unit_motion(lower, reference, axes, recording, freq)
-    return (base, response, total_force(channels, said, axes, force, place)), rows
+    _check_responses(parts, said, reference, recording)
+    has_base = any(channel.role == "base" for channel, _ in parts)
+    moved = None if has_base else _unit_motion(lower, reference, axes, recording, freq)
+    return run_of(parts, said, axes, str(recording.path), moved), rows
 
 
 def _check_responses(
-    given: dict[str, ComplexArray], sensors: Sequence[str], reference: str, recording: Recording
+    parts: Sequence[tuple[Channel, ComplexArray]], said: Description, reference: str, recording: Recording
 ) -> None:
-    """Refuse functions of responses, by name, where that of a sensor is missing, and magnitudes alone."""
-    missing = next((name for name in sensors if name not in given), None)
+    """Refuse functions of responses where that of a sensor is missing, and magnitudes alone."""
+    given = {channel.name: values for channel, values in parts if channel.role == "response"}
+    missing = next((sensor.name for sensor in sensors_of(said) if sensor.name not in given), None)
+    lacking = (
+        f"per unit of {reference or 'the reference'} the function of {missing!r} is missing: each sensor needs one"
+    )
+    real = "its functions are real numbers, magnitudes it seems: export complex ones, or real and imaginary part, or"
     refuse(
         (
             missing is not None,
-            f"{recording.path}: per unit of {reference or 'the reference'} the function of {missing!r} is missing: "
-            f"each sensor needs one for each reference, under the same name; {recording.in_words()}",
+            f"{recording.path}: {lacking} for each reference, under the same name; {recording.in_words()}",
         ),
         (
             not any(np.any(values.imag) for values in given.values()),
-            f"{recording.path}: its functions are real numbers, magnitudes it seems: export complex ones, or real and "
-            "imaginary part, or magnitude and phase in columns named so",
+            f"{recording.path}: {real} magnitude and phase in columns named so",
         ),
     )
 
@@ -176,25 +147,18 @@ def _of_reference(recording: Recording, channel: Channel, reference: str, said: 
         and reference == _reference(column, said)
         and channel.reference in ("", reference)
     ]
-    refuse(
-        (
-            len(found) > 1,
-            f"{recording.path}: {channel.column!r} stands there {len(found)} times per unit of "
-            f"{reference or 'nothing'} ({', '.join(column.place for column in found)}): two tests in "
-            "one file? Export each into its own",
-        )
+    places = f"per unit of {reference or 'nothing'} ({', '.join(column.place for column in found)})"
+    words = (
+        f"{channel.column!r} stands there {len(found)} times {places}: two tests in one file? Export each into its own"
     )
+    refuse((len(found) > 1, f"{recording.path}: {words}"))
     if str(channel.column) not in recording.names:
         recording.column(channel.column)  # raises, with what there is
     return next(iter(found), None)
 
 
 class _Form(NamedTuple):
-    """Kind of a function, by its unit.
-
-    `upper` and `lower` are quantities; both are "" of a number per the same, `lower` is "" of a spectrum, which is per
-    nothing.
-    """
+    """Kind of a function by its unit: its quantity ("" of a number per the same), and what it is per ("" of none)."""
 
     factor: float
     upper: str
@@ -208,23 +172,15 @@ def _form(recording: Recording, column: Column, channel: Channel, said: Descript
     text = channel.unit or column.unit
     if not text and said.frf == "transmissibility" and channel.role != "force":
         return _Form(1.0, "", "", "1")
-    refuse(
-        (
-            not text,
-            f"{place}: of this function no unit{' and no form' * (said.frf == '')} is stated: is it receptance, "
-            'mobility, accelerance or transmissibility? State frf = "..." (--frf) and unit = "m/s² / N" or the like',
-        )
-    )
+    unsaid = f"no unit{' and no form' * (said.frf == '')} is stated: is it receptance, mobility, accelerance or"
+    state = 'State frf = "..." (--frf) and unit = "m/s² / N" or the like'
+    refuse((not text, f"{place}: of this function {unsaid} transmissibility? {state}"))
     upper, lower = units.ratio(text, place)
     form = _Form(upper.factor / lower.factor, upper.quantity, lower.quantity, text)
     known = f"frf = {said.frf!r}" * bool(said.frf) or "no frf (transmissibility, of motions)"
-    refuse(
-        (
-            not _fits(form, channel.role, said.frf),
-            f"{place}: the unit {text!r} does not fit: {known} is stated, and a {channel.role} sensor gives "
-            f"{_OF_ROLE[channel.role]} per unit of the reference: mend frf (--frf), or the unit",
-        )
-    )
+    gives = f"a {channel.role} sensor gives {_OF_ROLE[channel.role]} per unit of the reference"
+    words = f"the unit {text!r} does not fit: {known} is stated, and {gives}: mend frf (--frf), or the unit"
+    refuse((not _fits(form, channel.role, said.frf), f"{place}: {words}"))
     return form
 
 
@@ -242,27 +198,20 @@ def _denominator(forms: Sequence[_Form], reference: str, recording: Recording) -
     """Unit that all functions of a reference are per; acceleration for numbers per the same, which are of any."""
     found = list(dict.fromkeys(form.lower for form in forms if form.upper))
     plain = any(not form.upper for form in forms)
-    refuse(
-        (
-            len(found) > 1 or (plain and not set(found) <= set(_MOTIONS)),
-            f"{recording.path}: functions per unit of {reference or 'the reference'} have the units "
-            f"{', '.join(dict.fromkeys(repr(form.unit) for form in forms))}: all need one and the same denominator",
-        )
-    )
+    listed = ", ".join(dict.fromkeys(repr(form.unit) for form in forms))
+    words = f"functions per unit of {reference or 'the reference'} have the units {listed}: all need one and the same"
+    mixed = len(found) > 1 or (plain and not set(found) <= set(_MOTIONS))
+    refuse((mixed, f"{recording.path}: {words} denominator"))
     return next(iter(found), "acceleration")
 
 
-def _unit_motion(
-    lower: str, reference: str, axes: Sequence[str], recording: Recording, freq: Array
-) -> ComplexArray:  # fmt: skip
+def _unit_motion(lower: str, reference: str, axes: Sequence[str], recording: Recording, freq: Array) -> ComplexArray:
     """The base's acceleration that moves by one unit of the reference."""
-    refuse(
-        (
-            lower not in _MOTIONS,
-            f"{recording.path}: functions are per unit of {lower or 'nothing'} ({reference or 'no reference'}), "
-            'so that the base\'s own motion per unit of it is needed: describe its channels with role = "base"',
-        )
+    per = (
+        f"functions are per unit of {lower or 'nothing'} ({reference or 'no reference'}), so that the base's own motion"
     )
+    words = f'{per} per unit of it is needed: describe its channels with role = "base"'
+    refuse((lower not in _MOTIONS, f"{recording.path}: {words}"))
     at, sign = _direction(reference, axes, recording)
     base: ComplexArray = np.zeros((len(axes), freq.size), complex)
     base[at] = sign * (2j * np.pi * freq) ** _ORDER.get(lower, 0)
@@ -274,13 +223,10 @@ def _direction(reference: str, axes: Sequence[str], recording: Recording) -> tup
     match = _ENDS_WITH_AXIS.fullmatch(reference.strip().lower())
     only = axes[0] if len(axes) == 1 else ""
     sign, axis = match.groups() if match else ("", only)
-    refuse(
-        (
-            axis not in axes,
-            f"{recording.path}: the reference {reference!r} is none of the base's axes {' '.join(axes)}: state "
-            'base_axes (--base-axes), or reference = "x" with each function',
-        )
+    words = (
+        f"the reference {reference!r} is none of the base's axes {' '.join(axes)}: state base_axes (--base-axes), or"
     )
+    refuse((axis not in axes, f'{recording.path}: {words} reference = "x" with each function'))
     return list(axes).index(axis), float(f"{sign}1")
 
 
@@ -304,10 +250,7 @@ def _convention(runs: Sequence[Any], said: Description) -> tuple[int, str]:
         product = np.conj(ratio[:, :-1]) * step
         delay -= float(np.sum(product.imag))
         size += float(np.sum(np.abs(product)))
-    if not abs(delay) > _CLEAR * size:
-        raise InputError(
-            f"{said.place}: whether spectra follow exp(+iwt) or exp(-iwt) does not show in these functions: state "
-            'convention = "exp(+iwt)" (--convention "exp(+iwt)")'
-        )
-    sign = 1 if delay > 0 else -1
-    return sign, f"spectra follow {CONVENTIONS[0 if sign > 0 else 1]}, told by responses that lag behind their cause"
+    words = "whether spectra follow exp(+iwt) or exp(-iwt) does not show in these functions: state convention = "
+    refuse((not abs(delay) > 0.02 * size, f'{said.place}: {words}"exp(+iwt)" (--convention "exp(+iwt)")'))
+    late = bool(delay > 0)
+    return 2 * late - 1, f"spectra follow {CONVENTIONS[not late]}, told by responses that lag behind their cause"

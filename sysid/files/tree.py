@@ -1,4 +1,4 @@
-"""A tree of dictionaries, lists, arrays and texts as the bytes of an HDF5 file that carries its own SHA-256.
+"""A tree of dictionaries, lists, arrays and texts as an HDF5 file with its own SHA-256; checks of HDF5 of others.
 
 ::
 
@@ -8,20 +8,23 @@
 What may stand in a tree: dict (its keys are names), list, numpy array of numbers, str, tuple of str, bool, int, float
 and None. It comes back as it was, but for the order of a dictionary's keys and for NUL characters at the end of a
 text. No class of the package is known here.
+
+HDF5 can take the numbers of a data set from any file of the machine (external storage, links to other files, virtual
+data sets), unpack a few bytes to terabytes, and load a library for a filter that it does not know. All of it is
+refused before a number is read, and so is a file that claims far more memory than it has bytes (`Allowance`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import math
 import re
 from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, shown
-from sysid.files import untrusted
-from sysid.files.untrusted import Allowance
+from sysid.errors import InputError, refuse, shown
 
 Tree = dict[str, Any]
 
@@ -34,21 +37,14 @@ _HEADER = re.compile(
 _LENGTH = "[]"  # the attribute by which a list is told from a dictionary
 _LONGEST_ATTRIBUTE = 4096  # bytes of a text; HDF5 itself allows 64 kB
 _NUMBERS = "buifc"  # kinds of arrays
+_LEAST = 2**28  # bytes that any file may unpack to
+_TIMES = 16  # its size, where that is more: records of dead channels pack well
+# Filters that are part of HDF5 or h5py, by their numbers: deflate, shuffle, Fletcher32, szip, n-bit, scale-offset, LZF.
+_FILTERS = (1, 2, 3, 4, 5, 6, 32000)
 
 
 def to_bytes(tree: Tree, number: int) -> bytes:
-    """The file of a tree.
-
-    Parameters
-    ----------
-    tree : dict
-    number : int
-        Of the format, for whoever reads the tree.
-
-    Returns
-    -------
-    bytes
-        The same for the same tree, whatever the order of its keys.
+    """The file of a tree, with the number of its format: the same bytes for one tree, whatever the order of its keys.
 
     Raises
     ------
@@ -95,35 +91,21 @@ def from_bytes(image: bytes) -> tuple[Tree, int]:
         raise _damaged("its bytes have another SHA-256 than those that were written")
     try:
         with h5py.File(io.BytesIO(image), "r") as file:
-            return read_group(file, Allowance(length), set()), number
+            return _read(file, Allowance(length), set()), number
     except InputError as error:
         raise _damaged(str(error)) from None
     except Exception as error:  # h5py raises what it likes, and anybody can write bytes with their right SHA-256
         raise _damaged(f"{type(error).__name__}: {error}") from None
 
 
-def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
-    """Everything in a group, as a dictionary or a list.
-
-    Parameters
-    ----------
-    group : h5py.Group
-    allowance : Allowance
-        Of its file.
-    before : set of int
-        Addresses of the groups and data sets that were read: each stands in one place.
-
-    Raises
-    ------
-    InputError
-        Where there is more in it than the file may hold, or a link. Other damage makes h5py raise what it likes.
-    """
+def _read(group: Any, allowance: Allowance, before: set[int]) -> Any:
+    """Everything in a group, as a dictionary or a list; `before` are addresses of what was read: each stands once."""
     import h5py
 
-    untrusted.check_links(group)
-    tree = {}
-    for name in group.attrs:
-        tree[name] = _value(untrusted.attribute(group, name, allowance))
+    for name in group:
+        if group.id.links.get_info(name.encode("utf-8", "surrogateescape")).type != h5py.h5l.TYPE_HARD:
+            raise _link(f"{group.name.rstrip('/')}/{name}")
+    tree = {name: _value(_attribute(group, name, allowance)) for name in group.attrs}
     for name in group:
         item = group[name]
         address = h5py.h5o.get_info(item.id).addr
@@ -131,23 +113,15 @@ def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
             raise InputError(f"{shown(item.name)} stands in two places")
         before.add(address)
         if isinstance(item, h5py.Dataset):
-            untrusted.check_data(item, allowance)
+            check_data(item, allowance)
             tree[name] = _value(_numbers(item), array=True)
         else:
-            tree[name] = read_group(item, allowance, before)
-    if _LENGTH in tree:
-        return [tree[str(i)] for i in range(tree[_LENGTH])]
-    return tree
+            tree[name] = _read(item, allowance, before)
+    return [tree[str(i)] for i in range(tree[_LENGTH])] if _LENGTH in tree else tree
 
 
 def check_tree(value: Any, at: str = "") -> None:
-    """Refuse what cannot stand in a tree.
-
-    Raises
-    ------
-    InputError
-        Says where it stands and what may stand there.
-    """
+    """Refuse what cannot stand in a tree: the InputError says where it stands and what may stand there."""
     if isinstance(value, dict):
         for name, part in value.items():
             if not isinstance(name, str) or not name or name in (".", _LENGTH) or "/" in name or "\0" in name:
@@ -235,3 +209,61 @@ def _value(value: Any, array: bool = False) -> Any:
         texts = tuple(text.decode("utf-8", "surrogatepass") for text in numbers.ravel().tolist())
         return texts if numbers.ndim else texts[0]
     return numbers if array else numbers.item()
+
+
+class Allowance:
+    """Bytes of memory that are `left` for the numbers of a file of `size` bytes."""
+
+    def __init__(self, size: int) -> None:
+        self._size, self.left = size, max(_LEAST, _TIMES * size)
+
+    def take(self, name: str, count: int) -> None:
+        """Take away what an array needs, or raise an `InputError` where that is more than is left."""
+        if count > self.left:
+            raise InputError(
+                f"{name} claims {count:.3g} bytes, in a file of {self._size} bytes: it is damaged, or export fewer "
+                "channels a file"
+            )
+        self.left -= count
+
+
+def check_all_links(file: Any) -> None:
+    """Refuse links to other files; a soft link to an object of the file stays, and is not followed."""
+    import h5py
+
+    def visit(name: str, link: Any) -> str | None:  # the first text ends the visit
+        return name if isinstance(link, h5py.ExternalLink) else None
+
+    found = file.visititems_links(visit)
+    if found is not None:
+        raise _link(found)
+
+
+def _link(name: str) -> InputError:
+    return InputError(f"{shown(name)} is a link to something else: only what stands in the file itself is read")
+
+
+def check_data(item: Any, allowance: Allowance) -> None:
+    """Refuse a data set whose numbers stand elsewhere, need a library, or would take more memory than is allowed."""
+    import h5py
+
+    properties, name = item.id.get_create_plist(), shown(item.name)
+    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
+        raise InputError(f"{name} has its numbers in another file: only what stands in the file itself is read")
+    filters = {properties.get_filter(at)[0] for at in range(properties.get_nfilters())}
+    if filters.difference(_FILTERS):
+        raise InputError(f"{name} is packed by a filter that is no part of HDF5: write it without, or with gzip")
+    allowance.take(name, math.prod(item.shape or ()) * item.dtype.itemsize)  # an empty one has no shape
+
+
+def _attribute(group: Any, name: str, allowance: Allowance) -> Any:
+    """The array of an attribute, or None where it is empty; refused where it would take more memory than is allowed."""
+    stored = group.attrs.get_id(name)
+    shape, dtype = stored.shape, stored.dtype  # each read from the file anew
+    if shape is None:
+        return None
+    allowance.take(shown(name), math.prod(shape) * dtype.itemsize)
+    refuse((dtype.kind == "O", f"{shown(name)}: an array of the type {dtype} stands in it"))
+    found = np.zeros(shape, dtype)
+    stored.read(found)
+    return found

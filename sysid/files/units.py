@@ -20,11 +20,6 @@ class Unit(NamedTuple):
     factor: float
 
 
-SI = {
-    "acceleration": "m/s²", "velocity": "m/s", "displacement": "m", "force": "N", "moment": "N m",
-    "angular acceleration": "rad/s²", "time": "s", "frequency": "Hz",
-}  # fmt: skip
-
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": INCH, "ft": 12 * INCH}
 _FORCES = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": POUND, "kip": 1e3 * POUND}
 

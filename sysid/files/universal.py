@@ -9,11 +9,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, needed
+from sysid.errors import InputError, needed, refuse
 from sysid.files import units
 from sysid.files.recording import Column, Recording, rate_of
 
@@ -23,9 +23,11 @@ _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 # Data types of functions whose unit no label tells: that of the set 164, and SI without one.
 _SPECIFIC = {8: "{length}", 9: "{force}", 11: "{length}/s", 12: "{length}/s²", 13: "{force}"}
-# Units by how many of them are an SI unit, as a set 164 states it.
-_LENGTHS = {1.0: "m", 100.0: "cm", 1000.0: "mm", 1 / units.INCH: "in", 1 / (12 * units.INCH): "ft"}
-_FORCES = {1.0: "N", 1000.0: "mN", 1e-3: "kN", 1 / units.POUND: "lbf"}
+# Units by how many of them are an SI unit, as a set 164 states it; SI without one, none where it has no name here.
+_SYSTEMS = {
+    "length": {1.0: "m", 100.0: "cm", 1000.0: "mm", 1 / units.INCH: "in", 1 / (12 * units.INCH): "ft"},
+    "force": {1.0: "N", 1000.0: "mN", 1e-3: "kN", 1 / units.POUND: "lbf"},
+}
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
 # A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
 _BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
@@ -40,28 +42,27 @@ _NO_LABEL = ("", "NONE")
 def read_universal(path: Path) -> list[Recording]:
     """The recordings of a universal file: its time records, or its spectra, run by run.
 
-    A load case is a run; a function without reference is told by its node and direction, as in ``12+X``.
-
-    Raises
-    ------
-    InputError
-        Without pyuff; a file cut short, of another type, without sets 58; lengths that differ.
+    A load case is a run; a function without reference is told by its node and direction, as in ``12+X``. Refused is a
+    file cut short, of another type, without sets 58, or whose lengths differ.
     """
     sets = _sets(path)
     stated = next((one for one in sets if one.get("type") == 164), {})
     points = _points(sets, 1 / (stated.get("length") or 1.0))
-    file_units = _Units(_of_system(stated, "length", _LENGTHS), _of_system(stated, "force", _FORCES))
+    file_units = {
+        quantity: next((name for one, name in known.items() if abs((stated.get(quantity) or 1.0) / one - 1) < 1e-4), "")
+        for quantity, known in _SYSTEMS.items()
+    }
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
     used = [(at, one) for at, one in functions if one["func_type"] in _READ]
-    if not used:
-        found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
-        raise InputError(
-            f"{path} holds no time records or frequency responses: sets {found}"
-            f"{', functions ' + ', '.join(sorted(kinds)) if kinds else ''}; export functions as sets 58 or 58b"
-        )
-    if len({one["func_type"] == 1 for _, one in used}) > 1:
-        raise InputError(f"{path} holds time records and frequency responses: export one kind into a file of its own")
+    found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
+    found += f", functions {', '.join(sorted(kinds))}" * bool(kinds)
+    none = f"no time records or frequency responses: sets {found}; export functions as sets 58 or 58b"
+    mixed = len({one["func_type"] == 1 for _, one in used}) > 1
+    refuse(
+        (not used, f"{path} holds {none}"),
+        (mixed, f"{path} holds time records and frequency responses: export one kind into a file of its own"),
+    )
     runs: dict[int, list[tuple[int, dict[str, Any]]]] = {}
     for at, one in used:
         runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
@@ -112,19 +113,6 @@ def _check_whole(path: Path, content: bytes) -> None:
         begin = _MARK.search(content, end.end())
 
 
-class _Units(NamedTuple):
-    """The file's units; "" where its set 164 states one that has no name here."""
-
-    length: str
-    force: str
-
-
-def _of_system(stated: dict[str, Any], quantity: str, known: dict[float, str]) -> str:
-    """The unit of a set 164, which states how many of it are an SI unit; the SI unit without such a set."""
-    size = float(stated.get(quantity) or 1.0)
-    return next((name for one, name in known.items() if abs(size / one - 1) < 1e-4), "")
-
-
 def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[float, ...]]:
     """Positions of the nodes, m."""
     return {
@@ -136,7 +124,7 @@ def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[fl
 
 
 def _recording(
-    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], file_units: _Units
+    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], file_units: dict[str, str]
 ) -> Recording:  # fmt: skip
     columns = tuple(_column(path, at, one, points, file_units) for at, one in run)
     first, lengths = run[0][1], {column.values.size for column in columns}
@@ -148,11 +136,10 @@ def _recording(
             "export tests of another length or rate with another load case, or into a file of their own"
         )
     x = np.asarray(first["x"], float)[: columns[0].values.size]
-    if first["func_type"] == 1:
-        if not first["abscissa_spacing"]:
-            return Recording(path, columns, sample_rate=rate_of(x, path, f"set {run[0][0]}"))
-        return Recording(path, columns, sample_rate=1 / first["abscissa_inc"])
-    return Recording(path, columns, freq=x)
+    if first["func_type"] != 1:
+        return Recording(path, columns, freq=x)
+    even = first["abscissa_spacing"]
+    return Recording(path, columns, 1 / first["abscissa_inc"] if even else rate_of(x, path, f"set {run[0][0]}"))
 
 
 def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -160,13 +147,10 @@ def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-6, atol=0))
 
 
-def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: _Units) -> Column:
+def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: dict[str, str]) -> Column:
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
-    if values.size < one["num_pts"]:
-        raise InputError(
-            f"{path}, set {at} ({name}): {values.size} of {one['num_pts']} values are there: it is cut short, or not "
-            "of the precision that it says; export it again"
-        )
+    words = f"{values.size} of {one['num_pts']} values are there: it is cut short, or not of the precision that it says"
+    refuse((values.size < one["num_pts"], f"{path}, set {at} ({name}): {words}; export it again"))
     spectrum = one["func_type"] == 4
     upper = _unit(one, "ordinate", file_units)
     lower = _unit(one, "orddenom", file_units) if spectrum else ""
@@ -184,7 +168,7 @@ def dof(node: int, direction: int) -> str:
     return f"{int(node)}{'-' if int(direction) < 0 else '+'}{name}"
 
 
-def _unit(one: dict[str, Any], side: str, file_units: _Units) -> str:
+def _unit(one: dict[str, Any], side: str, file_units: dict[str, str]) -> str:
     """Unit of an axis: its label where that names a unit, else the file's unit of its data type, else ""."""
     for key in (f"{side}_axis_units_lab", f"{side}_axis_lab"):
         label = str(one.get(key, "")).strip().strip("[]()")
@@ -193,5 +177,5 @@ def _unit(one: dict[str, Any], side: str, file_units: _Units) -> str:
     label = str(one.get(f"{side}_axis_units_lab", "")).strip()
     if label not in _NO_LABEL:
         return label  # unknown: whoever takes the channel says so
-    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**file_units._asdict())
+    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**file_units)
     return unit * (units.find(unit) is not None)

@@ -65,18 +65,17 @@ def read_xsens_dot(path: str | Path) -> UnitRecord:
         table = np.loadtxt(lines[header + 1 :], delimiter=",", ndmin=2)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
-    if table.shape[0] < 3 or table.shape[1] != len(columns):
-        raise InputError(
-            f"{file} has {table.shape[0]} rows of {table.shape[1]} values under {len(columns)} column names"
-        )
+    rows, width = table.shape
+    counts = f"{file} has {rows} rows of {width} values under {len(columns)} column names"
+    refuse((rows < 3 or width != len(columns), counts))
     pick = lambda names: table[1:, [columns.index(name) for name in names]].T  # noqa: E731
     time = pick((_TIME,))[0] * 1e-6
     acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))
-    if not np.all(np.isfinite([time, *acceleration, *rotation])):
-        raise InputError(f"{file} holds NaN or infinite samples")
     falls = np.diff(time) <= 0
-    if np.any(falls):
-        raise InputError(f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}")
+    refuse(
+        (not np.all(np.isfinite([time, *acceleration, *rotation])), f"{file} holds NaN or infinite samples"),
+        (np.any(falls), f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}"),
+    )
     return UnitRecord(time, acceleration, rotation)
 
 
@@ -98,7 +97,5 @@ def together(paths: Sequence[Path]) -> Recording:
         for path, unit in zip(paths, found, strict=True)
         for name, values in zip(_ACCELERATION, unit, strict=True)
     )
-    remarks = (
-        f"{len(paths)} units are brought to one clock; gravity and offsets are taken off: the mean of each channel",
-    )
-    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=remarks)
+    remark = f"{len(paths)} units are brought to one clock; gravity and offsets are taken off: the mean of each channel"
+    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=(remark,))

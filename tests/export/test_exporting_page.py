@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.export.export import FORMATS, precision
+from sysid.export.export import FORMATS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "exporting.md"
 pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="no documents beside the tests")
@@ -36,7 +36,6 @@ def test_the_python_of_the_page_runs_and_reads_what_was_written(result, tmp_path
 
 def test_the_page_has_every_ending_and_its_precision():
     rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
-    for ending in FORMATS:
+    for ending, form in FORMATS.items():
         (row,) = [row for row in rows if f"`{ending}`" in row]
-        said = precision(f"m{ending}")
-        assert row.split("|")[3].strip().startswith(said.partition(":")[0]), ending
+        assert row.split("|")[3].strip().startswith(form.precision.partition(":")[0]), ending

@@ -10,7 +10,8 @@ import pytest
 import scipy.io
 
 import sysid
-from sysid.files import reading, untrusted
+from sysid.files import reading, tree
+from sysid.files.arrays import check_matlab
 from sysid.files.tree import from_bytes, to_bytes
 
 HUGE = 10**6  # of a side
@@ -71,7 +72,7 @@ def npz(path):
     ],
 )
 def test_a_claim_on_memory_or_on_another_file_is_one_line(tmp_path, monkeypatch, name, make, words):
-    monkeypatch.setattr(untrusted, "_LEAST", 2**16)  # so that a test need not write what is too much
+    monkeypatch.setattr(tree, "_LEAST", 2**16)  # so that a test need not write what is too much
     make(tmp_path / name)
     with pytest.raises(sysid.InputError, match=words) as told:
         reading.gather(tmp_path / name, {"sample_rate": 1.0})
@@ -85,9 +86,9 @@ def test_what_matlab_packs_nests_or_leaves_empty_passes(tmp_path):
     }  # fmt: skip
     for packed in (False, True):
         scipy.io.savemat(tmp_path / "a.mat", content, do_compression=packed)
-        untrusted.check_matlab(tmp_path / "a.mat")
+        check_matlab(tmp_path / "a.mat")
     scipy.io.savemat(tmp_path / "a.mat", {"x": np.eye(3), "s": scipy.sparse.eye_array(3000)}, format="4")
-    untrusted.check_matlab(tmp_path / "a.mat")
+    check_matlab(tmp_path / "a.mat")
 
 
 def sound(write):
@@ -99,8 +100,6 @@ def sound(write):
 
 
 def signed(image):
-    from sysid.files import tree
-
     header = tree._header(1, len(image), b"0" * 64)
     digest = tree.hashlib.sha256(header + image[512:]).hexdigest().encode()
     return tree._header(1, len(image), digest) + image[512:]
