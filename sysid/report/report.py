@@ -27,10 +27,23 @@ from sysid.report.html import (
     sentence,
     table,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
-from sysid.report.opening import NoiseLevel, noise_of_test, opening, rounded, share_of_noise, trust
+from sysid.report.opening import (
+    CHOSEN,
+    ONE_OF_MANY,
+    Lines,
+    NoiseLevel,
+    half_widths,
+    matrix_tables,
+    noise_of_test,
+    opening,
+    rounded,
+    share_of_noise,
+    stated,
+    trust,
+    width_text,
+)
+from sysid.results.facts import COLUMNS, seconds_in_words
 from sysid.results.identification import Identification
-from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import JUDGEMENTS, residual_in_words
 from sysid.results.tables import (

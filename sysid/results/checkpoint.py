@@ -19,8 +19,7 @@ from sysid.errors import InputError, path_of, text
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
-from sysid.results.lock import alone
-from sysid.results.storage import atomically, unfinished_writings
+from sysid.results.storage import alone, atomically, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.journal import EVERY, Journal
 from sysid.search.refinement import RefineBy

@@ -8,7 +8,7 @@ import pytest
 import sysid
 from sysid.report.report import render
 from sysid.results.answer import modal_assurance
-from sysid.results.phases import COLUMNS, errors, rows_of_phases, seconds_in_words
+from sysid.results.facts import COLUMNS, errors, rows_of_phases, seconds_in_words
 
 
 @pytest.fixture(scope="module")

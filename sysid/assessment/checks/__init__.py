@@ -8,21 +8,36 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from sysid.assessment.checks.against_records import records_of_fit
-from sysid.assessment.checks.bounds import bounds_explain, keeping_bounds, on_a_bound, pressed_bounds
-from sysid.assessment.checks.changing import changing_frequencies
+from sysid.assessment.checks.against_records import exchanged_sensors, records_of_fit
 from sysid.assessment.checks.context import Check, Context, Ended
-from sysid.assessment.checks.exchanged import exchanged_sensors
 from sysid.assessment.checks.gains import assumed_totals
-from sysid.assessment.checks.goal import missed_goal
-from sysid.assessment.checks.limits import lines_left_out, search_boxes, unfitted_records
-from sysid.assessment.checks.model_error import beyond_noise, other_levels, unpredicted_tests
-from sysid.assessment.checks.noise import noise_of_records
-from sysid.assessment.checks.outliers import numbers_far_off
-from sysid.assessment.checks.search_end import no_solution, search_notes, stopped, untried_modes
-from sysid.assessment.checks.stated_mass import stated_masses
-from sysid.assessment.checks.stated_values import missed_values
-from sysid.assessment.checks.wrong_records import wrong_records
+from sysid.assessment.checks.mistakes import wrong_records
+from sysid.assessment.checks.model_error import (
+    beyond_noise,
+    changing_frequencies,
+    noise_of_records,
+    numbers_far_off,
+    other_levels,
+    unpredicted_tests,
+)
+from sysid.assessment.checks.search_end import (
+    lines_left_out,
+    missed_goal,
+    no_solution,
+    search_boxes,
+    search_notes,
+    stopped,
+    unfitted_records,
+    untried_modes,
+)
+from sysid.assessment.checks.stated import (
+    bounds_explain,
+    keeping_bounds,
+    missed_values,
+    on_a_bound,
+    pressed_bounds,
+    stated_masses,
+)
 from sysid.errors import refuse
 from sysid.finding import Finding, Severity
 from sysid.problem.prepared import Prepared

@@ -1,4 +1,4 @@
-"""The end of a search: stopped, without a solution, and what it tells of itself."""
+"""The end of a search: stopped, without a solution, short of its goal, within limits that the user should know of."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Kind, Severity
+from sysid.measurement.missing import in_words
+from sysid.structure.thresholds import UNEXPLAINED
 
 
 def stopped(context: Context) -> Iterator[Finding]:
@@ -45,3 +47,71 @@ def search_notes(context: Context) -> Iterator[Finding]:
     """Settings and steps of the search that the user should know of."""
     if context.outcome is not None:
         yield from (one for one in context.outcome.findings if one.severity in (Severity.CAUTION, Severity.NOTE))
+
+
+_CONVENTIONS = (
+    "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of rigid_body "
+    "right, the bounds wide enough?"
+)
+_SCALE = (
+    "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg in each "
+    "base direction, which the bounds of the stiffness may exclude: state total_mass, or give the base force"
+)
+
+
+def missed_goal(context: Context) -> Iterator[Finding]:
+    """The residual is above the goal, or explains nothing, or a constraint does not hold."""
+    end, problem = context.outcome, context.problem
+    if end is None:
+        return
+    if end.x is not None and end.success and not problem.keeps_constraints(end.x):
+        yield Finding("constraint", Severity.CONTRADICTS, "a constraint does not hold")
+    goal, residual = problem.stated.goal, context.residual
+    if goal is not None and residual > goal:
+        sentence = f"the residual {residual:.3g} is above the goal {goal:.3g}"
+        yield Finding("goal", Severity.CONTRADICTS, sentence, numbers={"residual": residual, "goal": goal})
+    if goal is None and residual > UNEXPLAINED and end.stopped is None and (end.success or not context.cut_short):
+        scaled = problem.unit_mass and not problem.formulation.stiffness.free
+        sentence, why = f"the residual {residual:.3g} is no fit", _SCALE if scaled else _CONVENTIONS
+        yield Finding("residual", Severity.CONTRADICTS, sentence, why, numbers={"residual": residual})
+
+
+def search_boxes(context: Context) -> Iterator[Finding]:
+    """Boxes in which a swarm searched that are not the usual ones."""
+    # Other strategies search all between the bounds.
+    if context.outcome is not None and any(phase.name == "swarm" for phase in context.outcome.history.phases):
+        for unknown in context.problem.formulation.unknowns:
+            if unknown.note:
+                yield Finding("search box", Severity.NOTE, unknown.note)
+
+
+def unfitted_records(context: Context) -> Iterator[Finding]:
+    """Records that a misfit of the user's own replaces, and damping that nothing tells."""
+    if context.outcome is None:
+        return
+    formulation = context.problem.formulation
+    if not formulation.fits_records:
+        sentence = "the problem states a misfit of its own; pictures and scores compare with the records as they are"
+        yield Finding("own misfit", Severity.NOTE, sentence)
+    if not formulation.tells_damping:
+        sentence = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
+        yield Finding("no damping ratio", Severity.NOTE, sentence)
+
+
+def lines_left_out(context: Context) -> Iterator[Finding]:
+    """Lines are left out for all channels, as a record holds NaN there."""
+    if context.outcome is None:
+        return
+    problem, formulation = context.problem, context.problem.formulation
+    # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
+    fitted = [problem.measurement] if formulation.fits_records else []
+    tests = [*fitted, *(term.test for term in formulation.further_tests)]
+    for i, test in enumerate(tests, start=problem.first_test):
+        if test.dropped:
+            where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""
+            which = "" if len(tests) == 1 else f" of test {i}"
+            yield Finding(
+                "lines left out", Severity.NOTE,
+                f"{test.dropped} lines at which a record holds NaN are left out{which} for all channels alike{where}",
+                numbers={"lines": float(test.dropped), "test": float(i)},
+            )  # fmt: skip
