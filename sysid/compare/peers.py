@@ -28,6 +28,10 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EPSILON
 
 MATRICES = ("M", "K", "C")
+PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
+HOW_TO_INSTALL = how_to_install("benchmark")
+_WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
+Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
 
 
 class Status(Enum):
@@ -130,14 +134,6 @@ def errors_of(structure: Structure, reference: Structure | None) -> tuple[float,
 
 def _alike(recovery: Array, other: Array) -> bool:
     return recovery.shape == other.shape and np.allclose(recovery, other)
-
-
-PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
-HOW_TO_INSTALL = how_to_install("benchmark")
-
-_WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
-
-Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
 
 
 class Spent(Exception):  # noqa: N818 - not an error

@@ -27,6 +27,12 @@ _ENDS_BELOW = (
 )
 
 Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
+_COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
+_HOLDS = (
+    "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
+    "and damping matrices are one choice"
+)
+_MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
 def matrix_tables(it: Identification) -> str:
@@ -119,14 +125,6 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
         }
         lines[i][j] = words_of.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
     return lines
-
-
-_COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
-_HOLDS = (
-    "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
-    "and damping matrices are one choice"
-)
-_MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
 class NoiseLevel(NamedTuple):

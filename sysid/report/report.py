@@ -11,7 +11,7 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import default_style
-from sysid.report.curves import curves, mode_shape_view, script
+from sysid.report.curves import curves, mode_shape_view
 from sysid.report.html import (
     Cell,
     aligned,
@@ -162,7 +162,6 @@ def render(identification: Identification) -> str:
             ("Effective masses", _effective_masses(it)),
             ("How it was found", _how(it) + _convergence(it) + _what_ran(it)),
         ],
-        script(),
     )
 
 

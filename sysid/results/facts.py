@@ -22,6 +22,7 @@ from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
 
 _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
+COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
 
 
 class ReportedUnknown(NamedTuple):
@@ -216,9 +217,6 @@ class PartOfProblem:
     records: StoredRecords
     attributes: dict[str, Any]
     without: str
-
-
-COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
 
 
 def seconds_in_words(seconds: float) -> str:

@@ -39,6 +39,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"  # formats 1 and 2 began with it, without a SHA-256
 _SUFFIXES = (".h5", ".hdf5")
 
 T = TypeVar("T")
+LOCK_NAME = ".sysid.lock"
 
 
 def write_tree(tree: Tree, path: str | Path) -> Path:
@@ -153,9 +154,6 @@ def remove_empty(folders: Sequence[Path]) -> None:
     with contextlib.suppress(OSError):
         for place in folders:
             place.rmdir()
-
-
-LOCK_NAME = ".sysid.lock"
 
 
 if sys.platform == "win32":

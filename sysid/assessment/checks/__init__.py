@@ -1,7 +1,7 @@
 """All checks of records and of fits: `CHECKS`, in the order of their weight.
 
 A check looks at a `Context` and yields findings; what it is about stands in the first line of its docstring, of which
-the table in docs/mistakes.md is made. Before a search there is no outcome, and checks of fits find nothing.
+the table in docs/mistakes.md is made. Before a search the records alone are looked at (`check_records`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from sysid.assessment.checks.against_records import exchanged_sensors, records_of_fit
 from sysid.assessment.checks.context import Check, Context, Ended
 from sysid.assessment.checks.gains import assumed_totals
-from sysid.assessment.checks.mistakes import wrong_records
+from sysid.assessment.checks.mistakes import mistakes_before_search, wrong_records
 from sysid.assessment.checks.model_error import (
     beyond_noise,
     changing_frequencies,
@@ -87,7 +87,7 @@ def check_records(problem: Prepared) -> tuple[Finding, ...]:
     InputError
         Where one is blocking, so that a search would be in vain.
     """
-    found = tuple(run(Context(problem)))
+    found = tuple(mistakes_before_search(problem))
     refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
     return found
 

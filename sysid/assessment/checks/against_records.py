@@ -29,6 +29,14 @@ from sysid.structure.thresholds import CANDIDATES, EXACT, FREE, MENDED, NEGLIGIB
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
+_SAME_SHAPE = 0.95  # modal assurance criterion
+_FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
+_RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
+_TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
+_MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
+_NEAR = 1.5  # half-power widths, or distances of lines, about a peak
+_CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
+_FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
 def records_of_fit(context: Context) -> Iterator[Finding]:
@@ -218,14 +226,6 @@ def _smooth(power: Array, lines: int = 11) -> Array:
     return np.asarray(uniform_filter1d(power, lines, mode="nearest"))
 
 
-_SAME_SHAPE = 0.95  # modal assurance criterion
-_FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
-_RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
-_TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
-_MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
-_NEAR = 1.5  # half-power widths, or distances of lines, about a peak
-
-
 class Peaks(NamedTuple):
     """Modes within the lines: numbers as users count them, Hz, half-power widths and distances of lines there, Hz."""
 
@@ -349,10 +349,6 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
     if there < _MISSED * elsewhere or there < NEGLIGIBLE:
         return None
     return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"
-
-
-_CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
-_FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
 def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:

@@ -240,14 +240,13 @@ class Ended(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """A problem with its outcome, and the findings of the checks that ran before.
+    """A problem with the end of its search, and the findings of the checks that ran before.
 
     Attributes
     ----------
     problem : Prepared
-        With what its records tell of the modes, which nothing asks before a search.
-    outcome : Outcome or None
-        None before a search.
+        With what its records tell of the modes.
+    end : Outcome
     cut_short : bool
         The time was over: a poor fit is blamed on nothing else.
     found : list of Finding
@@ -255,7 +254,7 @@ class Context:
     """
 
     problem: Prepared
-    outcome: Ended | None = None
+    end: Ended
     cut_short: bool = False
     found: list[Finding] = field(default_factory=list)
 
@@ -265,18 +264,10 @@ class Context:
         return self.problem.modal[0]
 
     @property
-    def end(self) -> Ended:
-        """The outcome, of which there is one."""
-        assert self.outcome is not None
-        return self.outcome
-
-    @property
     def is_judged(self) -> bool:
         """True where a search ended by itself; what was stopped on its way has misfits of another kind."""
-        end = self.outcome
-        if end is None or end.stopped is not None:
-            return False
-        return end.success or (self.problem.free_modes and not self.cut_short)
+        by_itself = self.end.success or (self.problem.free_modes and not self.cut_short)
+        return by_itself and self.end.stopped is None
 
     @cached_property
     def named(self) -> tuple[Finding, ...]:

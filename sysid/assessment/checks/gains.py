@@ -160,7 +160,7 @@ def assumed(problem: Prepared) -> Iterator[Finding]:
 
 def assumed_totals(context: Context) -> Iterator[Finding]:
     """A stated total of a lumped mass is taken to sit at the sensors."""
-    yield from () if context.outcome is None else taken_at_sensors(context.problem)
+    yield from taken_at_sensors(context.problem)
 
 
 def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:

@@ -380,19 +380,21 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
 
 
 def wrong_records(context: Context) -> Iterator[Finding]:
-    """Records, or what is stated of them, are wrong by a sign, a unit, a delay, a swapped sensor.
+    """Records, or what is stated of them, are wrong by a sign, a unit, a delay, a swapped sensor."""
+    yield from context.named
+
+
+def mistakes_before_search(prepared: Prepared) -> Iterator[Finding]:
+    """Mistakes that the records of a problem show before a search.
 
     Blocking where it spoils all channels, or a channel of a problem whose model has a form of its own, so that a
-    search would be in vain. After a search, what was named before or by it.
+    search would be in vain.
     """
-    if context.outcome is not None:
-        yield from context.named
-        return
-    problem, declared = context.problem.stated, context.problem.stated.declared
+    problem, declared = prepared.stated, prepared.stated.declared
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     for i, test in enumerate(tests, start=1):
-        for mistake in _of_test(context.problem, declared, test, first=test is problem.measurement):
+        for mistake in _of_test(prepared, declared, test, first=test is problem.measurement):
             in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
             one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
             yield one if len(tests) == 1 else one.of_test(i)

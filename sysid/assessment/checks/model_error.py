@@ -29,13 +29,18 @@ _CUT = (
     "these are plain spectra of records that move at their ends, which hold transients too: take whole records "
     "(from_time's estimator='records')"
 )
+_MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
+_EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
+_LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
+_OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
+_CLOSE = 0.06  # of their frequency, within which modes ..
+_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
+_LEAST_RATIO = 1e-4
 
 
 def beyond_noise(context: Context) -> Iterator[Finding]:
     """The model misses the records by more than their noise."""
-    if context.outcome is None or (
-        context.problem.stated.goal is not None and (context.named or not context.is_judged)
-    ):
+    if context.problem.stated.goal is not None and (context.named or not context.is_judged):
         return
     for miss in context.misses:
         if miss.times > BEYOND:
@@ -65,7 +70,7 @@ def unpredicted_tests(context: Context) -> Iterator[Finding]:
 def other_levels(context: Context) -> Iterator[Finding]:
     """A test that was not fitted moves more or less than any that was."""
     problem = context.problem
-    if context.outcome is None or not problem.formulation.fits_records:
+    if not problem.formulation.fits_records:
         return
     fitted = peaks(problem.stated.measurement)
     for i, test in enumerate(problem.stated.validation, start=1):
@@ -81,15 +86,6 @@ def other_levels(context: Context) -> Iterator[Finding]:
                 "hold at another",
                 numbers={"test": float(i), "peak": float(max(levels)), "fitted": float(max(fitted))},
             )  # fmt: skip
-
-
-_MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
-_EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
-_LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
-_OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
-_CLOSE = 0.06  # of their frequency, within which modes ..
-_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
-_LEAST_RATIO = 1e-4
 
 
 class Seen(NamedTuple):
@@ -320,7 +316,7 @@ def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Mea
 
 def noise_of_records(context: Context) -> Iterator[Finding]:
     """Noise of whole records that is not white or not told, and what a fit leaves beside it."""
-    for _, modal, _ in () if context.outcome is None else context.fits:
+    for _, modal, _ in context.fits:
         yield from noise_findings(modal)
 
 
@@ -362,9 +358,7 @@ def noise_findings(modal: ModalEstimate) -> Iterator[Finding]:
 
 def numbers_far_off(context: Context) -> Iterator[Finding]:
     """Numbers far from the fit: all where they count little, else those that stand alone."""
-    if context.outcome is None:
-        return
-    end, problem = context.outcome, context.problem
+    end, problem = context.end, context.problem
     remedy = ""
     if problem.stated.loss == "squares":
         what, remedy = (

@@ -9,18 +9,27 @@ from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.missing import in_words
 from sysid.structure.thresholds import UNEXPLAINED
 
+_CONVENTIONS = (
+    "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of rigid_body "
+    "right, the bounds wide enough?"
+)
+_SCALE = (
+    "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg in each "
+    "base direction, which the bounds of the stiffness may exclude: state total_mass, or give the base force"
+)
+
 
 def stopped(context: Context) -> Iterator[Finding]:
     """The search was stopped before it found a fit."""
-    end = context.outcome
-    if end is not None and end.stopped is not None and not end.success:
+    end = context.end
+    if end.stopped is not None and not end.success:
         yield _no_end("stopped", end.message)
 
 
 def no_solution(context: Context) -> Iterator[Finding]:
     """The solver ended without a solution."""
-    end = context.outcome
-    if end is not None and end.stopped is None and not end.success:
+    end = context.end
+    if end.stopped is None and not end.success:
         yield _no_end("no solution", end.message)
 
 
@@ -31,7 +40,7 @@ def _no_end(kind: Kind, message: str) -> Finding:
 
 def untried_modes(context: Context) -> Iterator[Finding]:
     """The fit of whole records was stopped before all modes were tried."""
-    tests = () if context.outcome is None else context.problem.modal
+    tests = context.problem.modal
     for number, modal in enumerate(tests, start=1):
         if modal.stopped:
             m = modal.omega.size
@@ -45,25 +54,12 @@ def untried_modes(context: Context) -> Iterator[Finding]:
 
 def search_notes(context: Context) -> Iterator[Finding]:
     """Settings and steps of the search that the user should know of."""
-    if context.outcome is not None:
-        yield from (one for one in context.outcome.findings if one.severity in (Severity.CAUTION, Severity.NOTE))
-
-
-_CONVENTIONS = (
-    "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of rigid_body "
-    "right, the bounds wide enough?"
-)
-_SCALE = (
-    "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg in each "
-    "base direction, which the bounds of the stiffness may exclude: state total_mass, or give the base force"
-)
+    yield from (one for one in context.end.findings if one.severity in (Severity.CAUTION, Severity.NOTE))
 
 
 def missed_goal(context: Context) -> Iterator[Finding]:
     """The residual is above the goal, or explains nothing, or a constraint does not hold."""
-    end, problem = context.outcome, context.problem
-    if end is None:
-        return
+    end, problem = context.end, context.problem
     if end.x is not None and end.success and not problem.keeps_constraints(end.x):
         yield Finding("constraint", Severity.CONTRADICTS, "a constraint does not hold")
     goal, residual = problem.stated.goal, context.residual
@@ -79,7 +75,7 @@ def missed_goal(context: Context) -> Iterator[Finding]:
 def search_boxes(context: Context) -> Iterator[Finding]:
     """Boxes in which a swarm searched that are not the usual ones."""
     # Other strategies search all between the bounds.
-    if context.outcome is not None and any(phase.name == "swarm" for phase in context.outcome.history.phases):
+    if any(phase.name == "swarm" for phase in context.end.history.phases):
         for unknown in context.problem.formulation.unknowns:
             if unknown.note:
                 yield Finding("search box", Severity.NOTE, unknown.note)
@@ -87,8 +83,6 @@ def search_boxes(context: Context) -> Iterator[Finding]:
 
 def unfitted_records(context: Context) -> Iterator[Finding]:
     """Records that a misfit of the user's own replaces, and damping that nothing tells."""
-    if context.outcome is None:
-        return
     formulation = context.problem.formulation
     if not formulation.fits_records:
         sentence = "the problem states a misfit of its own; pictures and scores compare with the records as they are"
@@ -100,8 +94,6 @@ def unfitted_records(context: Context) -> Iterator[Finding]:
 
 def lines_left_out(context: Context) -> Iterator[Finding]:
     """Lines are left out for all channels, as a record holds NaN there."""
-    if context.outcome is None:
-        return
     problem, formulation = context.problem, context.problem.formulation
     # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
     fitted = [problem.measurement] if formulation.fits_records else []

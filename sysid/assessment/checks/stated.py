@@ -33,6 +33,21 @@ from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF,
 
 _CLOSE = 1e-4  # .. and, where the range spans decades, of the bound itself
 _SHARE = 0.25  # of the squared misfit: bounds that explain less, to first order, are not its cause
+MISFIT = 1.5  # times what free residues leave, beyond which a force is not what the modes make of it
+_WITHIN = 1.15  # times the same, up to which mended records agree
+_MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
+_FACTORS = (  # of the weighed mass over the right one, and what they are in words
+    (1e-3, "1,000", "the base force is in kN, not N"),
+    (1e3, "1,000", "the base force is in N, and was taken for kN"),
+    (
+        STANDARD_GRAVITY,
+        "9.81",
+        "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)",
+    ),
+    (1 / STANDARD_GRAVITY, "9.81", "the base force is in kgf, not N"),
+    (1 / POUND, "4.448", "the base force is in lbf, not N"),
+    (POUND, "4.448", "the base force is in N, and was taken for lbf"),
+)
 
 
 class OnBound(NamedTuple):
@@ -151,9 +166,9 @@ def pressed_bounds(context: Context) -> Iterator[Finding]:
 
 def on_a_bound(context: Context) -> Iterator[Finding]:
     """Unknowns end on a bound, beyond which the truth may lie."""
-    if context.outcome is None or context.has("bounds"):
+    if context.has("bounds"):
         return
-    found = on_bounds(context.problem.screened, context.outcome.structure, context.outcome.x)
+    found = on_bounds(context.problem.screened, context.end.structure, context.end.x)
     if found:
         sentence = f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}"
         yield Finding("on a bound", Severity.NOTE, sentence, numbers={"unknowns": float(len(found))})
@@ -241,23 +256,6 @@ def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
     gained = fit.squared_error - poles.residual**2 * records.size
     least = max(records.noise(fit.left, fit.residues.size) * beyond_chance(count, CANDIDATES), exact)
     return Pressure(gained / max(fit.squared_error, exact), significant=bool(gained > least))
-
-
-MISFIT = 1.5  # times what free residues leave, beyond which a force is not what the modes make of it
-_WITHIN = 1.15  # times the same, up to which mended records agree
-_MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
-_FACTORS = (  # of the weighed mass over the right one, and what they are in words
-    (1e-3, "1,000", "the base force is in kN, not N"),
-    (1e3, "1,000", "the base force is in N, and was taken for kN"),
-    (
-        STANDARD_GRAVITY,
-        "9.81",
-        "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)",
-    ),
-    (1 / STANDARD_GRAVITY, "9.81", "the base force is in kgf, not N"),
-    (1 / POUND, "4.448", "the base force is in lbf, not N"),
-    (POUND, "4.448", "the base force is in N, and was taken for lbf"),
-)
 
 
 def stated_masses(context: Context) -> Iterator[Finding]:
@@ -356,8 +354,8 @@ def force_misfit(formulation: Formulation, test: Measurement, structure: Structu
 
 def missed_values(context: Context) -> Iterator[Finding]:
     """Stated masses, or values stated as known, cannot be met together with the records."""
-    if context.outcome is not None and not context.has("bounds"):
-        yield from (one for one in context.outcome.findings if one.kind == "stated masses")
+    if not context.has("bounds"):
+        yield from (one for one in context.end.findings if one.kind == "stated masses")
     if not context.is_explained and context.end.x is not None:
         formulation, x = context.problem.formulation, context.end.x
         yield from _priors(formulation, x)
