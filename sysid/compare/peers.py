@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.assessment.checks.context import Context
 from sysid.errors import InputError, SolverError, how_to_install
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
@@ -147,15 +148,7 @@ def missing_packages() -> list[str]:
 
 @dataclass(frozen=True)
 class Landscape:
-    """Objective that the swarm searches, and every peer with it.
-
-    Attributes
-    ----------
-    problem : Prepared
-    objective : SwarmObjective
-    steps : list of tuple of TestTerm
-        Tests with widened peaks for the local phase, where the swarm takes them.
-    """
+    """Objective that the swarm searches, and every peer with it; `steps` are tests with widened peaks."""
 
     problem: Prepared
     objective: SwarmObjective
@@ -203,19 +196,9 @@ class Evaluator:
 
 
 def run(name: str, landscape: Landscape, most: int, session: Session, recorder: Recorder) -> MethodResult:
-    """Search with a peer, then the local phase: where it ended.
+    """Search with one of `PEERS`, `most` evaluations, then the local phase: where it ended.
 
-    Parameters
-    ----------
-    name : str
-        One of `PEERS`.
-    landscape : Landscape
-    most : int
-        Evaluations.
-    session : Session
-        Its random source seeds the peer.
-    recorder : Recorder
-        Hears the session.
+    The session's random source seeds the peer; the recorder hears the session.
     """
     problem, evaluator = landscape.problem, Evaluator(landscape, most, session)
     words, stopped = _search(name, evaluator, session)
@@ -230,7 +213,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
     except (InputError, SolverError, np.linalg.LinAlgError) as error:  # the best candidate is no structure
         return MethodResult(name, Status.FAILED, str(error), evaluations=evaluator.count, seconds=session.seconds)
     solved = answer is not None and answer.success and x is answer.x
-    verdict = verdict_of(problem, Outcome(structure, x, name, solved, words, History(), stopped))
+    verdict = verdict_of(Context(problem, Outcome(structure, x, name, solved, words, History(), stopped)))
     return MethodResult(
         name,
         status_of(verdict.success, isinstance(stopped, KeyboardInterrupt) or session.interrupt.asked),

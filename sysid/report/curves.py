@@ -328,18 +328,9 @@ def mode_still(
 ) -> str:
     """One mode shape with the base, which stands still, over the structure at rest.
 
-    Parameters
-    ----------
-    name : str
-        Parts that stand below each other, with a comma between them.
-    points, shape : ndarray, shape (p, 3)
-        Where the points are about their middle, the base first; and how far they move.
-    sticks : sequence of (int, int)
-        Pairs of points.
-    size : float
-        Pixels of a unit of length.
-    first : bool
-        Of those of a page: the others show its structure at rest again.
+    Parts of the `name` stand below each other, with a comma between them. `points` (p, 3) are about their middle, the
+    base first, and move by `shape`; `size` is pixels of a unit of length. The `first` of a page shows the structure at
+    rest, the others show it again.
     """
     rest, moved = (_seen(where, size) for where in (points, points + shape))
     places = [[f"{x:.1f} {y:.1f}" for x, y in where] for where in (rest, moved)]

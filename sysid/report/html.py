@@ -62,11 +62,6 @@ def bullets(sentences: Iterable[object]) -> str:
     return f"<ul>{items}</ul>" if items else ""
 
 
-def beside(*parts: str) -> str:
-    """Set figures beside each other where there is room."""
-    return f'<div class="pair">{"".join(parts)}</div>'
-
-
 def table(
     head: Sequence[object],
     rows: Iterable[Sequence[object]],

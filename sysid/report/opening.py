@@ -107,11 +107,6 @@ def width_text(width: str) -> str:
     return width if width == "open" else f"{float(width):.6g}"
 
 
-def stated(it: Identification) -> Array:
-    """Which entries of the rigid-body mass were stated, (d, d) of bool."""
-    return it.facts.stated_rigid_body
-
-
 def _ranges(ends: Array, otherwise: Lines) -> Lines:
     """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
     lines = [list(line) for line in otherwise]
@@ -146,7 +141,8 @@ class NoiseLevel(NamedTuple):
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
-    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
+    against = bullets(sentence(str(one)) for one in it.contradictions[:FIRST])
+    judged = f"{paragraph(sentence(verdict(it)))}{against}<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
@@ -180,11 +176,6 @@ def _subject(it: Identification) -> str:
     return paragraph(words, "soft")
 
 
-def _reasons(it: Identification) -> str:
-    """HTML of what speaks against the answer most."""
-    return bullets(sentence(str(one)) for one in it.contradictions[:FIRST])
-
-
 def _steps(it: Identification) -> list[str]:
     """Steps to do next, the first thing first."""
     steps = [sentence(step) for step in next_steps(it)]
@@ -205,7 +196,7 @@ def _steps(it: Identification) -> list[str]:
 
 def _masses(it: Identification) -> Iterator[tuple[str, str]]:
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
-    by_user = np.diag(stated(it))
+    by_user = np.diag(it.facts.stated_rigid_body)
     for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
         what, unit = ("moment of inertia", "kg m²") if axis.startswith("r") else ("total mass", "kg")
         if it.facts.unit_mass:

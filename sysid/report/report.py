@@ -15,7 +15,6 @@ from sysid.report.curves import curves, mode_shape_view
 from sysid.report.html import (
     Cell,
     aligned,
-    beside,
     bullets,
     escaped,
     heat_maps,
@@ -38,7 +37,6 @@ from sysid.report.opening import (
     opening,
     rounded,
     share_of_noise,
-    stated,
     trust,
     width_text,
 )
@@ -253,8 +251,8 @@ def _rigid_body_mass(it: Identification) -> str:
             "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
         )
     elif u is not None:
-        below = half_widths(rigid, u.rigid_body_mass, stated(it))
-        label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not stated(it).any())
+        below = half_widths(rigid, u.rigid_body_mass, it.facts.stated_rigid_body)
+        label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not it.facts.stated_rigid_body.any())
     parts += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
         parts += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
@@ -377,8 +375,9 @@ def _poles(it: Identification) -> str:
     indicator = plot.cmif(it)
     for figure in (diagram, indicator):
         figure.set_size_inches(5.6, 4.2)  # beside each other, and on a phone, at nearly the size of their words
-    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
-        picture(diagram, "stabilisation diagram", right=0.7), picture(indicator, "complex mode indicator function")
+    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + (
+        f'<div class="pair">{picture(diagram, "stabilisation diagram", right=0.7)}'
+        f"{picture(indicator, 'complex mode indicator function')}</div>"
     )
 
 

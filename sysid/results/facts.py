@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
+from sysid.problem.formulation import Formulation
 from sysid.problem.given import MATRICES
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest
@@ -46,27 +47,11 @@ class ReportedUnknown(NamedTuple):
 class Facts(NamedTuple):
     """Facts of a problem for readers of a result.
 
-    Attributes
-    ----------
-    unit_mass, fits_records : bool
-        As of `Problem` and `Formulation`.
-    mass_is_free, mass_is_lumped : bool
-    by_accelerations : bool
-        Accelerations alone are fitted, which leave a common factor of M, K and C open.
-    misses : tuple of (str, float)
-        What was stated as known to some accuracy, and by how many standard deviations the answer misses it.
-    unknowns : tuple of ReportedUnknown
-    counts : tuple of (str, int)
-        Scalar unknowns a matrix.
-    n_variables : int
-    models : tuple of (str, str)
-        A matrix, and its model with what that states.
-    stated_rigid_body : (d, d) of bool
-        Which entries of the rigid-body mass are stated.
-    assumed : tuple of str
-        Sentences.
-    tells_damping : bool
-        As of `Formulation`.
+    `unit_mass`, `fits_records` and `tells_damping` are those of the problem and its formulation. `by_accelerations`:
+    these alone are fitted, which leave a common factor of M, K and C open. `misses`: what was stated as known to some
+    accuracy, and by how many standard deviations the answer misses it. `counts`: scalar unknowns a matrix. `models`: a
+    matrix, and its model with what that states. `stated_rigid_body`: which entries of the rigid-body mass are stated.
+    `assumed`: sentences.
     """
 
     unit_mass: bool
@@ -115,12 +100,9 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
         if x is not None
         for name, z in zip(prior.labels, prior.numbers(x), strict=True)
     ]
-    reported = {id(one) for one in reported_unknowns(problem)}
     unknowns = [
-        ReportedUnknown(
-            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in reported
-        )
-        for one in reported_unknowns(problem, damping_ratios=True)
+        ReportedUnknown(one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), is_ratio)
+        for one, is_ratio in _reported_unknowns(formulation)
     ]
     return Facts(
         unit_mass=bool(problem.unit_mass),
@@ -142,16 +124,17 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
     )
 
 
-def reported_unknowns(problem: Prepared, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
-    """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
+def _reported_unknowns(formulation: Formulation) -> Iterator[tuple[Unknown, bool]]:
+    """Unknowns that mean something by themselves, and which are free damping ratios, that stand in the table of modes.
 
-    The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
-    stand in the table of modes, and are among them only where asked for.
+    Those of models with a form of their own, and variables, fixed too. The entries of a free matrix's factor are none,
+    nor are shares of which only the ratios count.
     """
-    formulation = problem.formulation
-    stated = (formulation.mass.free, formulation.stiffness.free, formulation.damping.free and not damping_ratios)
-    of_models = (v for group, free in zip(formulation.of_models, stated, strict=True) for v in group if not free)
-    return (*(v for v in of_models if not v.relative), *formulation.variables)
+    shown = (not formulation.mass.free, not formulation.stiffness.free, True)
+    ratios = (False, False, formulation.damping.free)
+    for group, among, are_ratios in zip(formulation.of_models, shown, ratios, strict=True):
+        yield from ((one, are_ratios) for one in group if among and not one.relative)
+    yield from ((one, False) for one in formulation.variables)
 
 
 def _models(problem: Prepared) -> Iterator[tuple[str, str]]:
@@ -201,15 +184,9 @@ class StoredRecords:
 class PartOfProblem:
     """Part of a problem in a file that does not hold it whole.
 
-    Attributes
-    ----------
-    tree, readings : dict
-        What `Problem.to_tree` and `sysid.results.readings` made.
-    records : Records
-    attributes : dict
-        All that readers of the result ask of the problem: attributes of `Answer` by their names.
-    without : str
-        Why the problem cannot be made of it, for a message.
+    `tree` and `readings` as `Problem.to_tree` and `sysid.results.readings` made them; `attributes` are those of
+    `Answer`, by name, for which readers ask the problem; `without` is why the problem cannot be made of it, for a
+    message.
     """
 
     tree: dict[str, Any]
@@ -224,35 +201,14 @@ def seconds_in_words(seconds: float) -> str:
     return f"{seconds:.2g} s" if not seconds >= 99.5 else f"{seconds:.0f} s"
 
 
-class Searched(Protocol):
-    """A result, as far as its phases go."""
-
-    @property
-    def prepared(self) -> Prepared:
-        """The problem that was identified."""
-
-    @property
-    def history(self) -> History:
-        """The history of its search."""
-
-    @property
-    def structure(self) -> Structure:
-        """The answer."""
-
-    @property
-    def x(self) -> Array | None:
-        """Its unknowns."""
-
-
-def rows_of_phases(it: Searched) -> list[list[str]]:
+def rows_of_phases(problem: Prepared, history: History, structure: Structure, x: Array | None) -> list[list[str]]:
     """A row of `COLUMNS` for each phase of the search that gave the answer; the truth's columns "-" without one.
 
     Frequencies: largest relative error; MAC: of the mode that is told least; M_SS, K_SS and C: relative error in
     Frobenius norm, "-" for C where the truth has no damping. An iterate of a local solver counts as a candidate. Of a
     phase that ended at no structure, and of a result that tells no unknowns, only objectives are known.
     """
-    history = it.history
-    rows = [_row(it, phase) for phase in history.phases if phase.x.size]
+    rows = [_row(problem, phase, structure, x) for phase in history.phases if phase.x.size]
     left = ("start", history.start), ("swarm", history.swarm), ("local phase", history.local)
     plain = [(name, value) for name, value in left if np.isfinite(value)]
     return rows or [[name, f"{value:.4g}", *["-"] * (len(COLUMNS) - 2)] for name, value in plain]
@@ -276,12 +232,12 @@ def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
     return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
 
 
-def _row(it: Searched, phase: Phase) -> list[str]:
-    problem, truth = it.prepared, it.prepared.stated.reference
+def _row(problem: Prepared, phase: Phase, answer: Structure, x: Array | None) -> list[str]:
+    truth = problem.stated.reference
     # The graph of the matrices, which a hundred sensors cannot wait for, is not built for the answer itself.
-    answered = it.x is not None and np.array_equal(phase.x, it.x)
+    answered = x is not None and np.array_equal(phase.x, x)
     try:
-        structure = it.structure if answered else problem.structure(phase.x)
+        structure = answer if answered else problem.structure(phase.x)
     except (InputError, np.linalg.LinAlgError):
         left = [f"{phase.objective:.4g}", "no structure", *["-"] * 5]
         return [phase.name, *left, str(phase.evaluations), f"{phase.seconds:.1f}"]

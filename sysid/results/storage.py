@@ -189,24 +189,12 @@ class _HeldError(Exception):
 
 @contextlib.contextmanager
 def alone(lock: Path, what: str, remedy: str) -> Iterator[None]:
-    """Hold a lock; it is gone at the end, with the folders that were made for it if nothing else is in them.
+    """Hold a lock on a file; it is gone at the end, with the folders that were made for it if nothing else is in them.
 
-    The operating system's lock on an open file ends with the process, after a kill too. Where the file system has
-    none (Lustre, for example), a file names its owner, and is stale where that has ended.
-
-    Parameters
-    ----------
-    lock : Path
-        The file that is locked.
-    what : str
-        What is used, for the message.
-    remedy : str
-        What to do where another process holds it, for the message.
-
-    Raises
-    ------
-    InputError
-        Where another process, or another thread of this one, holds it, or the file cannot be written.
+    The operating system's lock on an open file ends with the process, after a kill too. Where the file system has none
+    (Lustre, for example), a file names its owner, and is stale where that has ended. Raises InputError, in which
+    `what` is in use and `remedy` tells what to do, where another process, or another thread of this one, holds it, or
+    the file cannot be written.
     """
     missing = missing_folders(lock.parent)
     try:

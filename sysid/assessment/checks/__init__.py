@@ -31,11 +31,11 @@ from sysid.assessment.checks.search_end import (
     untried_modes,
 )
 from sysid.assessment.checks.stated import (
-    bounds_explain,
     keeping_bounds,
     missed_values,
     on_a_bound,
     pressed_bounds,
+    pressure_of,
     stated_masses,
 )
 from sysid.errors import refuse
@@ -94,5 +94,5 @@ def check_records(problem: Prepared) -> tuple[Finding, ...]:
 
 def mistakes_of_poor_fit(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
     """Sensors that were swapped, where that explains what a search leaves, so that no other would do better."""
-    pressed = bounds_explain(problem, end.structure, end.x)  # what they leave may look like swapped sensors
-    return exchanged_sensors(problem, end.structure, wholly=pressed)
+    _, pressed = pressure_of(problem, end)  # what bounds leave may look like swapped sensors
+    return exchanged_sensors(problem, end.structure, wholly=pressed.explains)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, of_tests
 from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
 from sysid.assessment.checks.stated import MISFIT, force_misfit
 from sysid.errors import InputError
@@ -46,9 +46,8 @@ def records_of_fit(context: Context) -> Iterator[Finding]:
     problem, end = context.problem.screened, context.end
     formulation, changing = problem.formulation, context.has("changing")
     fits = problem.fits(end.structure, end.x)
-    for i, (modal, its) in enumerate(fits, start=1):
-        found = [one for one in _of_records(formulation, modal, its, changing) if one not in context.found]
-        yield from found if len(fits) == 1 else [one.of_test(i) for one in found]
+    found = [_of_records(formulation, modal, its, changing) for modal, its in fits]
+    yield from of_tests([[one for one in of_one if one not in context.found] for of_one in found])
 
 
 def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Structure, changing: bool) -> list[Finding]:
@@ -97,25 +96,19 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
+    possible, whose, figure = float(np.sqrt(free.squared_error / records.size)), "its poles", "free residues"
+    wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
+    if misfit <= MISFIT * max(possible, EXACT):
+        poles = None if formulation.free_modes else PolesAndResidues.of(test)
+        possible = np.inf if poles is None else poles.of_accelerations
+        whose, figure = "the poles of the data", "poles of the data"
+        wrong = "the form of its mass, stiffness or damping, recovery, or a bound is not the structure's"
+    possible = max(possible, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
-            f"{misses}, its poles with free residues {100 * possible:.3g} %: the model, a sign or axis in rigid_body, "
-            "or a record is not what it is said to be",
-            numbers={"misfit": misfit, "free residues": possible},
-        )  # fmt: skip
-        return
-    poles = None if formulation.free_modes else PolesAndResidues.of(test)
-    if poles is None:
-        return
-    possible = max(poles.of_accelerations, EXACT)
-    if misfit > MISFIT * possible:
-        yield Finding(
-            "misfit", Severity.CONTRADICTS,
-            f"{misses}, the poles of the data with free residues {100 * possible:.3g} %: the form of its mass, "
-            "stiffness or damping, recovery, or a bound is not the structure's",
-            numbers={"misfit": misfit, "poles of the data": possible},
+            f"{misses}, {whose} with free residues {100 * possible:.3g} %: {wrong}",
+            numbers={"misfit": misfit, figure: possible},
         )  # fmt: skip
 
 
@@ -277,15 +270,10 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
 
 
 def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
-    """Averages over segments have too few lines in most peaks of poles found in them.
+    """Averages over segments have too few lines in most peaks of poles found in them, in rad/s and ratios, (m,) each.
 
     Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
     peak about one and a half distances of lines wide.
-
-    Parameters
-    ----------
-    omega, ratios : (m,)
-        rad/s, fractions of critical damping.
     """
     f = omega / (2 * np.pi)
     inside = (f >= test.freq[0]) & (f <= test.freq[-1])
@@ -352,15 +340,9 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
 
 
 def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
-    """Two sensors that stand in each other's place; none where the model cannot tell.
+    """Two sensors that stand in each other's place, by the best fit to the records; none where the model cannot tell.
 
-    Parameters
-    ----------
-    problem : Prepared
-    structure : Structure
-        The best fit to the records as they are.
-    wholly : bool
-        Whether the exchange must leave no more than free residues do, as there is another cause of the misfit.
+    `wholly`: the exchange must leave no more than free residues do, as there is another cause of the misfit.
     """
     formulation, test = problem.formulation, problem.measurement
     distinguishable = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors

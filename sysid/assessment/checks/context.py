@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -59,13 +59,6 @@ def misses_of(problem: Prepared, structure: Structure, x: Array | None) -> list[
     """Misfit of the structure to accelerations and base force of each test that is fitted.
 
     Records whose noise is neither stated nor to be found are left out; numbers that stand alone are not counted.
-
-    Parameters
-    ----------
-    problem : Prepared
-    structure : Structure
-    x : (n_variables,) or None
-        The unknowns that stand for it.
     """
     misses = list(_misses(problem, structure, x, []))
     if problem.stated.loss == "squares" and any(miss.times > BEYOND for miss in misses):  # spikes may be all there is
@@ -184,16 +177,8 @@ def _quiet(
 def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
     """Noise that is not known, at most: what a fit leaves of the quietest quarter of the lines.
 
-    Parameters
-    ----------
-    test : Measurement
-    left : ndarray, shape (runs, channels, n_freq)
-        Measured less predicted.
-
-    Returns
-    -------
-    ndarray, shape (runs, channels, 1), or None
-        Standard deviations; None with few lines, and of transmissibilities, whose noise may be in proportion to them.
+    Standard deviations (runs, channels, 1) by what is left (runs, channels, n_freq); None with few lines, and of
+    transmissibilities, whose noise may be in proportion to them.
     """
     quiet = None if test.has_unit_runs else _quiet(left, np.ones(left.shape), test.own_lines)
     return None if quiet is None else np.asarray(np.sqrt(quiet)[..., None])
@@ -317,3 +302,9 @@ class Context:
 
 
 Check = Callable[[Context], Iterator[Finding]]
+
+
+def of_tests(found: Sequence[Iterable[Finding]]) -> Iterator[Finding]:
+    """Findings of each test, with its number where there are several."""
+    for i, of_one in enumerate(found, start=1):
+        yield from (one.of_test(i) if len(found) > 1 else one for one in of_one)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.assessment.checks.against_records import unresolved
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, of_tests
 from sysid.assessment.checks.stated import wrong_statements
 from sysid.errors import InputError
 from sysid.files.units import STANDARD_GRAVITY
@@ -59,15 +59,9 @@ def is_gross(mistake: Finding) -> bool:
 
 
 def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
-    """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell.
+    """Mistakes that a test shows by itself and its direct terms, the worst first; none where it cannot tell.
 
     Those that spoil all channels are blocking.
-
-    Parameters
-    ----------
-    test : Measurement
-    terms : DirectTerms or None
-        Of the test, as `direct_terms` gives them.
     """
     if terms is None:
         return []
@@ -393,11 +387,10 @@ def mistakes_before_search(prepared: Prepared) -> Iterator[Finding]:
     problem, declared = prepared.stated, prepared.stated.declared
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
-    for i, test in enumerate(tests, start=1):
-        for mistake in _of_test(prepared, declared, test, first=test is problem.measurement):
-            in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
-            one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
-            yield one if len(tests) == 1 else one.of_test(i)
+    found = [_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests]
+    for one in of_tests(found):
+        in_vain = is_gross(one) and not declared.free_modes
+        yield one._replace(severity=Severity.BLOCKING) if in_vain else one
 
 
 def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:

@@ -99,17 +99,9 @@ class Seen(NamedTuple):
 
 
 class Change:
-    """A mode in the stretches of all records.
+    """A mode in the stretches of all records: its frequency over all of them and half-power width, Hz.
 
-    Parameters
-    ----------
-    mode : float
-        Its frequency over all of them, Hz.
-    width : float
-        Half-power width, Hz.
-    seen : list of Seen
-    scaled : bool
-        Whether levels are in m/s².
+    `scaled` tells that levels are in m/s².
     """
 
     def __init__(self, mode: float, width: float, seen: list[Seen], scaled: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, of_tests
 from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.missing import in_words
 from sysid.structure.thresholds import UNEXPLAINED
@@ -40,16 +40,15 @@ def _no_end(kind: Kind, message: str) -> Finding:
 
 def untried_modes(context: Context) -> Iterator[Finding]:
     """The fit of whole records was stopped before all modes were tried."""
-    tests = context.problem.modal
-    for number, modal in enumerate(tests, start=1):
-        if modal.stopped:
-            m = modal.omega.size
-            finding = Finding(
-                "modes not all tried", Severity.CAUTION,
-                f"the fit of modes was stopped when it had {m}, before all that the records may show were tried",
-                "let it end: without --max-time (max_time=), or with more", numbers={"modes": float(m)},
-            )  # fmt: skip
-            yield finding if len(tests) == 1 else finding.of_test(number)
+    yield from of_tests([[_untried(modal.omega.size)] * modal.stopped for modal in context.problem.modal])
+
+
+def _untried(modes: int) -> Finding:
+    return Finding(
+        "modes not all tried", Severity.CAUTION,
+        f"the fit of modes was stopped when it had {modes}, before all that the records may show were tried",
+        "let it end: without --max-time (max_time=), or with more", numbers={"modes": float(modes)},
+    )  # fmt: skip
 
 
 def search_notes(context: Context) -> Iterator[Finding]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, Ended
 from sysid.assessment.checks.gains import distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
 from sysid.errors import InputError, listed
@@ -53,17 +53,8 @@ _FACTORS = (  # of the weighed mass over the right one, and what they are in wor
 class OnBound(NamedTuple):
     """An unknown that ends on a bound.
 
-    Attributes
-    ----------
-    name, entry : str
-        "damping ratio" and " 3", "k" and "[0]".
-    side : {"lower", "upper"}
-    bound : str
-        With its unit.
-    source : str
-        Who states it: a model's name, or the place where a variable is declared.
-    place : int
-        In x; -1 for a natural frequency, which is none of the problem's unknowns.
+    `name` and `entry` as "k" and "[0]"; `bound` with its unit; `source` is who states it, a model's name or the place
+    where a variable is declared; `place` in x, -1 for a natural frequency, which is none of the problem's unknowns.
     """
 
     name: str
@@ -90,13 +81,7 @@ def sides_of(lower: Array, upper: Array, values: Array, relative: ArrayLike = Fa
 def on_bounds(problem: Prepared, structure: Structure, x: Array | None) -> list[OnBound]:
     """Unknowns that end on bounds which the search kept: those of models, variables, and stated frequencies.
 
-    Parameters
-    ----------
-    problem : Prepared
-    structure : Structure
-        The answer.
-    x : (n_variables,) or None
-        The unknowns that stand for it; None where the modal strategy chose other degrees of freedom.
+    The unknowns x (n_variables,) are None where the modal strategy chose other degrees of freedom.
     """
     formulation, parts = problem.formulation, problem.formulation.parts
     at = _ratios_alone(formulation, structure) if x is None else x
@@ -153,14 +138,14 @@ def bounds_in_words(found: Sequence[OnBound]) -> str:
 def keeping_bounds(context: Context) -> Iterator[Finding]:
     """Bounds keep the fit from the records; whatever else a misfit speaks against may be right once they are wider."""
     if context.is_judged and not context.named:
-        found, press = _pressure_of(context)
+        found, press = pressure_of(context.problem.screened, context.end)
         yield from (_pressing(found, press),) if press.explains else ()
 
 
 def pressed_bounds(context: Context) -> Iterator[Finding]:
     """Bounds take a little of the fit, where nothing else speaks against it."""
     if context.is_judged and not (contradicting(context.found) or context.has("changing", "beyond noise")):
-        found, press = _pressure_of(context)
+        found, press = pressure_of(context.problem.screened, context.end)
         yield from (_pressing(found, press),) if press.significant else ()
 
 
@@ -174,8 +159,8 @@ def on_a_bound(context: Context) -> Iterator[Finding]:
         yield Finding("on a bound", Severity.NOTE, sentence, numbers={"unknowns": float(len(found))})
 
 
-def _pressure_of(context: Context) -> tuple[list[OnBound], Pressure]:
-    problem, end = context.problem.screened, context.end
+def pressure_of(problem: Prepared, end: Ended) -> tuple[list[OnBound], Pressure]:
+    """Unknowns that end on bounds, and what they would gain beyond them."""
     found = on_bounds(problem, end.structure, end.x)
     return found, pressure(problem, end.structure, end.x, found)
 
@@ -206,24 +191,12 @@ class Pressure(NamedTuple):
         return self.significant and self.share >= _SHARE
 
 
-def bounds_explain(problem: Prepared, structure: Structure, x: Array | None) -> bool:
-    """True where bounds on which unknowns end are a cause of the misfit."""
-    return pressure(problem, structure, x, on_bounds(problem, structure, x)).explains
-
-
 def pressure(problem: Prepared, structure: Structure, x: Array | None, found: Sequence[OnBound]) -> Pressure:
     """The part of the misfit that unknowns on bounds would take away.
 
     The squared misfit less that of the linear least squares about x: with all unknowns free, over those with the ones
-    on bounds held. Where modes are free the misfit of free residues, at the structure's poles over those at the data's.
-
-    Parameters
-    ----------
-    problem : Prepared
-    structure : Structure
-    x : (n_variables,) or None
-        The answer.
-    found : sequence of OnBound
+    on bounds held. Where modes are free the misfit of free residues, at the structure's poles over those at the
+    data's.
     """
     if found and (x is None or problem.free_modes):
         return _of_poles(problem, structure, len(found))
