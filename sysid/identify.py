@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.checks import check_records, mistakes_of_poor_fit
-from sysid.assessment.checks.changing import changing
+from sysid.assessment.checks.model_error import changing
 from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
 from sysid.finding import Finding
 from sysid.modal_analysis.fit import fit_tests

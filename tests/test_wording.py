@@ -34,8 +34,7 @@ from sysid.cli import doctor, refine, requests
 from sysid.cli import main as cli
 from sysid.cli.files import alone_in, results_folder
 from sysid.cli.output import Output
-from sysid.compare import table
-from sysid.compare.comparison import Comparison
+from sysid.compare.comparison import Comparison, comparison_text
 from sysid.files import reading
 from sysid.files.assembly import work_of_force
 from sysid.finding import Finding, Severity
@@ -475,9 +474,7 @@ def test_a_comparison_says_what_its_columns_are():
     noisy = sysid.simulate(TRUTH, LINES, noise=0.01, rng=0)
     told = [
         " ".join(
-            table.comparison_text(Comparison(Problem(test, mass=FullMass(), reference=truth), 0, None, ())).split("\n")[
-                1:
-            ]
+            comparison_text(Comparison(Problem(test, mass=FullMass(), reference=truth), 0, None, ())).split("\n")[1:]
         )
         for test, truth in ((TEST, None), (TEST, undamped), (noisy, TRUTH))
     ]

@@ -104,10 +104,6 @@ def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: 
     rivals : sequence of (n_variables,)
         Other unknowns found to explain the data as well.
 
-    Returns
-    -------
-    Determination
-
     Raises
     ------
     InputError

@@ -147,22 +147,10 @@ class Sensitivity:
 def sensitivity(
     formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
 ) -> Sensitivity:
-    """Rank, null directions and noise of all unknowns at `x`.
+    """Rank, null directions and noise of all unknowns at `x`, (n_variables,).
 
-    Parameters
-    ----------
-    formulation : Formulation
-    x : (n_variables,)
-    slopes : Slopes, optional
-        Those of the problem's own matrices at x, where they are known.
-    priors : bool
-        With what is stated as known to some accuracy, or without it.
-    as_stated : bool
-        As in `Term.linearised`.
-
-    Returns
-    -------
-    Sensitivity
+    `slopes` are those of the problem's own matrices at x, where they are known; `priors` counts what is stated as
+    known to some accuracy; `as_stated` is that of `Term.linearised`.
     """
     rows = rows_of(formulation, x, slopes, priors=priors, as_stated=as_stated)
     return _judged(formulation, x, rows, np.full(x.size, True))

@@ -121,12 +121,8 @@ def adjust(
 ) -> Adjusted:
     """Adjust modal parameters to statements by Gauss-Newton steps, so many at most.
 
-    Parameters
-    ----------
-    theta : (size,)
-        What the records alone make likeliest; without a force at any scale of the modes.
-    normals : (size, k)
-        What one standard normal each makes of it.
+    The records alone make `theta` (size,) likeliest, without a force at any scale of the modes; `normals` (size, k)
+    are what one standard normal each makes of it.
     """
     k, weighed = normals.shape[1], problem.measurement.force is not None
     m = index.shapes[1][0]
@@ -167,12 +163,8 @@ def conditioned(
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Moves of theta that records and statements together leave: of a standard normal each, unseen, and shifts.
 
-    Parameters
-    ----------
-    normals, unseen : (size, k), (size, q)
-        Those that the records alone leave.
-    shifts : (size, r)
-        What errors that are no noise make of theta where the records alone are fitted.
+    The records alone leave `normals` (size, k) and `unseen` (size, q); `shifts` (size, r) is what errors that are no
+    noise make of theta where they alone are fitted.
     """
     stated = statements_of(problem, structure)
     if stated is None:

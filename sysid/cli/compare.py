@@ -10,9 +10,9 @@ from sysid.cli.files import png, results_folder, write_files
 from sysid.cli.output import Output, strict_json
 from sysid.cli.requests import recipe_of
 from sysid.cli.starting import INTERRUPTED, NOT_REACHED, SUCCESS
-from sysid.compare import peers, table
-from sysid.compare.comparison import Comparison, compare
-from sysid.compare.method_result import MethodResult
+from sysid.compare import peers
+from sysid.compare.comparison import Comparison, as_csv, compare, comparison_text, line
+from sysid.compare.peers import MethodResult
 from sysid.results.identification import Recipe
 from sysid.results.version import __version__
 
@@ -29,12 +29,12 @@ def run(options: argparse.Namespace, out: Output) -> int:
         out.write("the problem has no reference, so errors of M, K and C are not known\n")
 
     def tell(result: MethodResult) -> None:
-        out.progress(f"{table.line(result)}\n")
+        out.progress(f"{line(result)}\n")
 
     compared = compare(problem, rng=options.seed, max_time=options.max_time, listener=tell)
     if not compared.results:
         raise KeyboardInterrupt
-    out.write(f"\n{table.comparison_text(compared)}\n\n")
+    out.write(f"\n{comparison_text(compared)}\n\n")
     out.answer(comparison={"problem": recipe.module, "parameters": recipe.parameters, **compared.to_dict()})
     _write(compared, recipe, folder, out, rows=options.out is not None)
     if compared.interrupted:
@@ -52,6 +52,6 @@ def _write(compared: Comparison, recipe: Recipe, folder: Path, out: Output, *, r
         files["comparison.png"] = png(comparison, compared, recipe.title)
     if rows:
         head = {"problem": recipe.module, "parameters": recipe.parameters, "version": __version__}
-        files["comparison.csv"] = table.as_csv(compared).encode()
+        files["comparison.csv"] = as_csv(compared).encode()
         files["comparison.json"] = strict_json({**head, **compared.to_dict()}).encode()
     write_files(folder, files, out)

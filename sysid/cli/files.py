@@ -16,10 +16,8 @@ from sysid.cli.output import Output, strict_json
 from sysid.errors import InputError, refuse, shown_plainly
 from sysid.results.checkpoint import Checkpoint
 from sysid.results.identification import Identification
-from sysid.results.lock import FILE_NAME as LOCK
-from sysid.results.lock import alone
 from sysid.results.storage import FILE_NAME as RESULT
-from sysid.results.storage import atomically, missing_folders, remove_empty
+from sysid.results.storage import LOCK_NAME, alone, atomically, missing_folders, remove_empty
 from sysid.search.session import TimeIsOver, within
 
 _SUMMARY = "summary.json"
@@ -42,7 +40,7 @@ def results_folder(given: str | None, default: Path) -> Path:
 
 def alone_in(folder: Path, remedy: str) -> contextlib.AbstractContextManager[None]:
     """Let no other run write in a folder of results; where one does, it is refused with the remedy."""
-    return alone(folder / LOCK, f"folder of results {folder}", remedy)
+    return alone(folder / LOCK_NAME, f"folder of results {folder}", remedy)
 
 
 def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:

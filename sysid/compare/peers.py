@@ -1,4 +1,4 @@
-"""Optimisers of other packages on the swarm's own objective, with its budget and its local phase.
+"""Optimisers of other packages on the swarm's own objective, with its budget and its local phase; results of methods.
 
 All of them search the unit cube that stands for the search space. None is imported before it is used.
 """
@@ -8,28 +8,133 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
+from itertools import groupby
+from typing import Any
 
 import numpy as np
 
-from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
+from sysid.assessment.checks.context import Context
 from sysid.errors import InputError, SolverError, how_to_install
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
+from sysid.results.facts import matrix_errors
 from sysid.results.judgement import verdict_of
 from sysid.search.continuation import descend
-from sysid.search.session import Session
+from sysid.search.session import Progress, Session
 from sysid.search.strategy import History, Outcome
 from sysid.search.swarm import Swarm
 from sysid.search.swarm_objective import SwarmObjective
-from sysid.structure.structure import Array
+from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EPSILON
 
+MATRICES = ("M", "K", "C")
 PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
 HOW_TO_INSTALL = how_to_install("benchmark")
-
 _WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
-
 Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
+
+
+class Status(Enum):
+    """End of a method, in the words of the table."""
+
+    FIT = "fit"
+    NO_FIT = "no fit"
+    REFUSED = "does not apply"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """Where one method ended.
+
+    Attributes
+    ----------
+    name : str
+    status : Status
+    message : str
+        The solver's words, or why the method did not run.
+    before, after : float
+        Objective before and after the local phase; NaN where there is none. Before that of continuation is its guess.
+    residual : float
+        Relative residual at the end, unweighted, as `Identification.residual`.
+    errors : (3,)
+        Of M_SS, K_SS and C: Frobenius norm of the difference from the reference's, in % of the reference's; NaN where
+        there is no reference, or one of other degrees of freedom, and of C where the reference has no damping.
+    evaluations : int
+        Candidates whose objective was computed before the local phase; 0 for a method without candidates.
+    seconds : float
+    phases : tuple of (str, (k, 2))
+        Name of each phase, and what it reported: seconds since the start of the method, and objective.
+    widened : bool
+        The phases report of records with widened peaks, so that no step to the next is one of the records.
+    """
+
+    name: str
+    status: Status
+    message: str = ""
+    before: float = np.nan
+    after: float = np.nan
+    residual: float = np.nan
+    errors: tuple[float, ...] = (np.nan,) * len(MATRICES)
+    evaluations: int = 0
+    seconds: float = np.nan
+    phases: tuple[tuple[str, Array], ...] = ()
+    widened: bool = False
+
+    @property
+    def ran(self) -> bool:
+        """True where it left anything."""
+        return bool(np.isfinite(self.after))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row of the table, for CSV and JSON; the phases are not in it."""
+        errors = {f"error_{name}_percent": value for name, value in zip(MATRICES, self.errors, strict=True)}
+        figures = {name: getattr(self, name) for name in ("before", "after", "residual")}
+        return {
+            "method": self.name,
+            "status": self.status.value,
+            **figures,
+            **errors,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "message": self.message,
+        }
+
+
+class Recorder:
+    """A listener that keeps what a search reports."""
+
+    def __init__(self) -> None:
+        self.heard: list[Progress] = []
+
+    def __call__(self, progress: Progress) -> None:
+        """Keep one report."""
+        self.heard.append(progress)
+
+    @property
+    def phases(self) -> tuple[tuple[str, Array], ...]:
+        """Phases in the order in which they ran, poles apart, as `MethodResult` has them."""
+        groups = groupby(self.heard, key=lambda progress: progress.phase)
+        curves = [(phase, np.array([(p.seconds, p.objective) for p in group])) for phase, group in groups]
+        return tuple((phase, curve) for phase, curve in curves if phase != "poles")
+
+
+def status_of(success: bool, interrupted: bool) -> Status:
+    """The status of a method that ran."""
+    return Status.INTERRUPTED if interrupted else (Status.NO_FIT, Status.FIT)[success]
+
+
+def errors_of(structure: Structure, reference: Structure | None) -> tuple[float, ...]:
+    """Errors of M_SS, K_SS and C in %: see `MethodResult.errors`."""
+    if reference is None or not _alike(structure.recovery, reference.recovery):
+        return MethodResult.errors
+    return tuple(100 * error for error in matrix_errors(structure, reference))
+
+
+def _alike(recovery: Array, other: Array) -> bool:
+    return recovery.shape == other.shape and np.allclose(recovery, other)
 
 
 class Spent(Exception):  # noqa: N818 - not an error
@@ -43,15 +148,7 @@ def missing_packages() -> list[str]:
 
 @dataclass(frozen=True)
 class Landscape:
-    """Objective that the swarm searches, and every peer with it.
-
-    Attributes
-    ----------
-    problem : Prepared
-    objective : SwarmObjective
-    steps : list of tuple of TestTerm
-        Tests with widened peaks for the local phase, where the swarm takes them.
-    """
+    """Objective that the swarm searches, and every peer with it; `steps` are tests with widened peaks."""
 
     problem: Prepared
     objective: SwarmObjective
@@ -99,19 +196,9 @@ class Evaluator:
 
 
 def run(name: str, landscape: Landscape, most: int, session: Session, recorder: Recorder) -> MethodResult:
-    """Search with a peer, then the local phase: where it ended.
+    """Search with one of `PEERS`, `most` evaluations, then the local phase: where it ended.
 
-    Parameters
-    ----------
-    name : str
-        One of `PEERS`.
-    landscape : Landscape
-    most : int
-        Evaluations.
-    session : Session
-        Its random source seeds the peer.
-    recorder : Recorder
-        Hears the session.
+    The session's random source seeds the peer; the recorder hears the session.
     """
     problem, evaluator = landscape.problem, Evaluator(landscape, most, session)
     words, stopped = _search(name, evaluator, session)
@@ -126,7 +213,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
     except (InputError, SolverError, np.linalg.LinAlgError) as error:  # the best candidate is no structure
         return MethodResult(name, Status.FAILED, str(error), evaluations=evaluator.count, seconds=session.seconds)
     solved = answer is not None and answer.success and x is answer.x
-    verdict = verdict_of(problem, Outcome(structure, x, name, solved, words, History(), stopped))
+    verdict = verdict_of(Context(problem, Outcome(structure, x, name, solved, words, History(), stopped)))
     return MethodResult(
         name,
         status_of(verdict.success, isinstance(stopped, KeyboardInterrupt) or session.interrupt.asked),

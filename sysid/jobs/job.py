@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from sysid import catalogue
+from sysid.assessment.checks.context import Context
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
@@ -169,7 +170,7 @@ def _refined(job: Job, session: Session) -> JobResult:
     # What ended a search needs no widened peaks.
     end = _descended(problem, x, [] if from_recipe else _widened(bare, job.source), session)
     assert end.x is not None
-    verdict = verdict_of(problem, end)
+    verdict = verdict_of(Context(problem, end))
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
 
 

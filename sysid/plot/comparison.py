@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.compare.comparison import Comparison
-from sysid.compare.method_result import MethodResult
+from sysid.compare.peers import MethodResult
 from sysid.plot.canvas import COLOURS, FAINT, INK, dress, new_figure, plain_log
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EPSILON

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,107 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sysid.structure.structure import Array
-
-
-STYLE = """
-:root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
-  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00;
-  --seen: #a0a5ac; }
-@media screen and (prefers-color-scheme: dark) { :root { --paper: #14181d; --ink: #e6eaee; --soft: #a9b3be;
-  --line: #39424c; --fill: #20272e; --link: #86bfee; --good: #3cc296; --warn: #e5a94b; --bad: #f47f77;
-  --found: #62b6f0; --left: #f0995a; --seen: #767f89; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1180px; color: var(--ink); background: var(--paper);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.5rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
-h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
-p, figcaption { margin: .5rem 0; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
-ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
-.pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
-.pair figure { flex: 1 1 500px; min-width: 0; }
-.mark { border: 1px solid var(--line); border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
-  background: var(--fill); font-size: .8rem; white-space: nowrap; }
-td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.25; }
-.soft, figcaption { color: var(--soft); font-size: .9rem; }
-.verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .5rem 1rem;
-  margin: .6rem 0; }
-.verdict strong { font-size: 1.1rem; }
-.verdict p { margin: .25rem 0; }
-.good { border-left-color: var(--good); } .warn { border-left-color: var(--warn); }
-.bad { border-left-color: var(--bad); }
-.good strong { color: var(--good); } .warn strong { color: var(--warn); } .bad strong { color: var(--bad); }
-.scroll { overflow-x: auto; margin: .6rem 0 1rem; }
-@media screen { .scroll:has(table) { background:
-    linear-gradient(to left, var(--paper) 50%, transparent) right / 3rem 100% no-repeat local,
-    linear-gradient(to left, rgb(128 138 150 / .45), transparent) right / 1rem 100% no-repeat; }
-  .scroll:has(table) figcaption, td:first-child, thead th:first-child { background: var(--paper); }
-  .scroll:has(table) figcaption { margin: 0; padding: .5rem 0; }
-  td:first-child, thead th:first-child { position: sticky; left: 0; } }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
-th, td { padding: .2rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
-thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
-  white-space: normal; }
-.words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
-th:first-child, td:first-child { text-align: left; } td:first-child { font-weight: 500; }
-@media screen { td:first-child { white-space: normal; } }
-.words td:first-child { white-space: nowrap; }
-figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
-img { max-width: 100%; height: auto; display: block; background: #fff; }
-.maps { display: flex; flex-wrap: wrap; gap: 0 1.5rem; } .maps figure { flex: 0 1 300px; margin: 0; }
-.maps img { width: 300px; border: 1px solid var(--line); } .maps img, .bar { image-rendering: pixelated; }
-.bar { display: inline-block; width: 160px; height: .8em; vertical-align: middle; }
-pre { background: var(--fill); padding: .8rem 1rem; font-size: .82rem; line-height: 1.45; white-space: pre-wrap;
-  overflow-wrap: anywhere; }
-nav { margin: .8rem 0; font-size: .9rem; }
-nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
-.controls { display: flex; flex-wrap: wrap; gap: .4rem .9rem; align-items: center; font-size: .9rem; margin: .6rem 0; }
-.controls select, .controls button { font: inherit; color: var(--ink); background: var(--fill);
-  border: 1px solid var(--soft); border-radius: 4px; padding: .15rem .5rem; max-width: 100%; }
-.controls label { max-width: 100%; }
-.area { touch-action: pan-y; user-select: none; margin-top: .4rem; }
-.shapes { display: flex; flex-wrap: wrap; gap: .5rem; } .shapes svg { flex: 0 0 auto; }
-.told { min-height: 3em; font-variant-numeric: tabular-nums; font-size: .9rem; }
-svg { display: block; max-width: 100%; height: auto; } svg text { fill: var(--soft); font-size: 11px; }
-svg .title { fill: var(--ink); font-size: 12px; }
-svg path, svg line { fill: none; stroke-width: 1.6; vector-effect: non-scaling-stroke; }
-svg .grid { stroke: var(--line); stroke-width: 1; } svg .cursor { stroke: var(--soft); stroke-width: 1; }
-svg .zoom { fill: var(--soft); opacity: .2; }
-svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke: var(--found); }
-svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
-svg .left { stroke: var(--left); }
-svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
-svg .dot { fill: var(--found); } svg .dots { stroke: var(--found); stroke-width: 6; stroke-linecap: round; }
-svg .base { fill: var(--soft); }
-.legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
-.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
-.key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
-.key.recorded { border-color: var(--good); }
-.key.noise { border-top-style: dashed; } .key.band { border-top: 3px dotted var(--found); }
-[hidden] { display: none !important; }
-.sheets { display: flex; flex-wrap: wrap; gap: 0 1rem; } .sheet { flex: 1 1 330px; max-width: 540px; min-width: 0; }
-.sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
-@media screen { .drawn .sheets { display: none; } }
-@media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  td:first-child { max-width: 9em; }
-  .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
-  h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
-  .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; }
-  nav, .controls, .area, .told { display: none; } .modes, .curves { break-inside: auto; }
-  .sheet, .shapes svg { break-inside: avoid; } .shapes, .sheets { display: block; }
-  .sheet { display: inline-block; width: 49%; } .sheet p { margin-top: .2rem; }
-  .shapes svg { display: inline-block; width: 24%; }
-  .shapes, .sheets { orphans: 1; widows: 1; }
-  .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
-  .maps { display: block; } .maps figure { display: inline-block; width: 32%; } .maps img { width: 100%; }
-  .pair { flex-wrap: nowrap; break-inside: avoid; } .pair figure { flex-basis: 0; }
-  table { font-size: 7.5pt; } .words { font-size: 9pt; } .wide { font-size: 5.5pt; }
-  th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
-  h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
-  h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }
-  .soft, figcaption { font-size: 9pt; } }
-"""
 
 
 class Cell(NamedTuple):
@@ -160,11 +60,6 @@ def bullets(sentences: Iterable[object]) -> str:
     """Set a list of plain sentences; nothing where there are none."""
     items = "".join(f"<li>{escaped(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
-
-
-def beside(*parts: str) -> str:
-    """Set figures beside each other where there is room."""
-    return f'<div class="pair">{"".join(parts)}</div>'
 
 
 def table(
@@ -248,11 +143,12 @@ def _image(png: bytes, attributes: str) -> str:
     return f'<img {attributes} src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}">'
 
 
-def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: str = "") -> str:
+def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:
     """Join the sections, (heading, content), to a page with links to each; empty ones are left out.
 
-    Nothing runs in it but `script`, as the page says to the browser.
+    Nothing runs in it but its own script, as the page says to the browser.
     """
+    style, script = (files("sysid.report").joinpath(name).read_text("utf-8") for name in ("page.css", "curves.js"))
     kept = [(name, content) for name, content in sections if content]
     links = " ".join(f'<a href="#s{i}">{escaped(name)}</a>' for i, (name, _) in enumerate(kept))
     body = "\n".join(
@@ -264,7 +160,7 @@ def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: 
         '<meta http-equiv="Content-Security-Policy" '
         f"content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escaped(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
         f"<h1>{escaped(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n<script>{script}</script>\n"
         "</body>\n</html>\n"
     )

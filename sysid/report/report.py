@@ -11,11 +11,10 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import default_style
-from sysid.report.curves import curves, mode_shape_view, script
+from sysid.report.curves import curves, mode_shape_view
 from sysid.report.html import (
     Cell,
     aligned,
-    beside,
     bullets,
     escaped,
     heat_maps,
@@ -27,10 +26,22 @@ from sysid.report.html import (
     sentence,
     table,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
-from sysid.report.opening import NoiseLevel, noise_of_test, opening, rounded, share_of_noise, trust
+from sysid.report.opening import (
+    CHOSEN,
+    ONE_OF_MANY,
+    Lines,
+    NoiseLevel,
+    half_widths,
+    matrix_tables,
+    noise_of_test,
+    opening,
+    rounded,
+    share_of_noise,
+    trust,
+    width_text,
+)
+from sysid.results.facts import COLUMNS, seconds_in_words
 from sysid.results.identification import Identification
-from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import JUDGEMENTS, residual_in_words
 from sysid.results.tables import (
@@ -149,7 +160,6 @@ def render(identification: Identification) -> str:
             ("Effective masses", _effective_masses(it)),
             ("How it was found", _how(it) + _convergence(it) + _what_ran(it)),
         ],
-        script(),
     )
 
 
@@ -241,8 +251,8 @@ def _rigid_body_mass(it: Identification) -> str:
             "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
         )
     elif u is not None:
-        below = half_widths(rigid, u.rigid_body_mass, stated(it))
-        label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not stated(it).any())
+        below = half_widths(rigid, u.rigid_body_mass, it.facts.stated_rigid_body)
+        label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not it.facts.stated_rigid_body.any())
     parts += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
         parts += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
@@ -365,8 +375,9 @@ def _poles(it: Identification) -> str:
     indicator = plot.cmif(it)
     for figure in (diagram, indicator):
         figure.set_size_inches(5.6, 4.2)  # beside each other, and on a phone, at nearly the size of their words
-    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
-        picture(diagram, "stabilisation diagram", right=0.7), picture(indicator, "complex mode indicator function")
+    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + (
+        f'<div class="pair">{picture(diagram, "stabilisation diagram", right=0.7)}'
+        f"{picture(indicator, 'complex mode indicator function')}</div>"
     )
 
 

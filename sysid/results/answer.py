@@ -221,10 +221,10 @@ class Answer:
 
     @cached_property
     def phases(self) -> list[list[str]]:
-        """Table of the phases of the search: see `sysid.results.phases.rows_of_phases`."""
-        from sysid.results.phases import rows_of_phases
+        """Table of the phases of the search: see `sysid.results.facts.rows_of_phases`."""
+        from sysid.results.facts import rows_of_phases
 
-        return rows_of_phases(self)
+        return rows_of_phases(self.prepared, self.history, self.structure, self.x)
 
     @property
     def noise(self) -> NoiseLevels | None:

@@ -19,8 +19,7 @@ from sysid.errors import InputError, path_of, text
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
-from sysid.results.lock import alone
-from sysid.results.storage import atomically, unfinished_writings
+from sysid.results.storage import alone, atomically, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.session import EVERY, Journal
 from sysid.search.strategy import Strategy
@@ -44,18 +43,10 @@ _CONTENT, _FORMAT = "unfinished search", 2
 
 @dataclass(frozen=True)
 class RunRequest:
-    """Arguments with which a command line began a search.
+    """Arguments with which a command line began a search; `refine_by` is that of its swarm, where it was chosen.
 
-    Attributes
-    ----------
-    recipe : Recipe
-    strategy : str
-    seed : int
-        Of the search.
-    refine_by : str or None
-        Of its swarm, where that was chosen.
-    source : str
-        Digest of the files that the problem was made from: a user's own model is code, which no problem holds.
+    `source` is a digest of the files that the problem was made from: a user's own model is code, which no problem
+    holds.
     """
 
     recipe: Recipe
@@ -103,13 +94,7 @@ class RunRequest:
 class Checkpoint:
     """The file of an unfinished search: there from its start until its result is safe.
 
-    Attributes
-    ----------
-    path : str or Path
-    request : RunRequest, optional
-        Stands in the file for whoever is to go on.
-    every : float
-        s between two writings.
+    The `request` stands in it for whoever is to go on; `every` is s between two writings.
     """
 
     path: Path
@@ -163,11 +148,7 @@ class Checkpoint:
         """Give the journal of a search, with what the file has of it; at the end all is written.
 
         Where the search then has nothing to go on with, the file vanishes, and the folders that were made for it.
-
-        Raises
-        ------
-        InputError
-            Where the file is of another search than `search` (see `identity`), is in use, or cannot be written.
+        Raises InputError where the file is of another search (see `identity`), is in use, or cannot be written.
         """
         lock = self.path.with_name(f".{self.path.name}.lock")
         with alone(lock, str(self.path), "wait for its end, or give another file"), self._journal(search) as journal:

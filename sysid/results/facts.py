@@ -1,4 +1,4 @@
-"""Records of a problem, and facts beside them that summary, report and export ask for: what its file always holds."""
+"""Facts of a problem that readers of a result ask for, its records, and the table of the phases of its search."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sysid.assessment.checks.gains import taken_at_sensors
+from sysid.assessment.sensitivity import system_matrices
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
+from sysid.problem.formulation import Formulation
+from sysid.problem.given import MATRICES
 from sysid.problem.matrices import MATRICES
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest
+from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
 
 _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
+COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
 
 
 class ReportedUnknown(NamedTuple):
@@ -42,27 +48,11 @@ class ReportedUnknown(NamedTuple):
 class Facts(NamedTuple):
     """Facts of a problem for readers of a result.
 
-    Attributes
-    ----------
-    unit_mass, fits_records : bool
-        As of `Problem` and `Formulation`.
-    mass_is_free, mass_is_lumped : bool
-    by_accelerations : bool
-        Accelerations alone are fitted, which leave a common factor of M, K and C open.
-    misses : tuple of (str, float)
-        What was stated as known to some accuracy, and by how many standard deviations the answer misses it.
-    unknowns : tuple of ReportedUnknown
-    counts : tuple of (str, int)
-        Scalar unknowns a matrix.
-    n_variables : int
-    models : tuple of (str, str)
-        A matrix, and its model with what that states.
-    stated_rigid_body : (d, d) of bool
-        Which entries of the rigid-body mass are stated.
-    assumed : tuple of str
-        Sentences.
-    tells_damping : bool
-        As of `Formulation`.
+    `unit_mass`, `fits_records` and `tells_damping` are those of the problem and its formulation. `by_accelerations`:
+    these alone are fitted, which leave a common factor of M, K and C open. `misses`: what was stated as known to some
+    accuracy, and by how many standard deviations the answer misses it. `counts`: scalar unknowns a matrix. `models`: a
+    matrix, and its model with what that states. `stated_rigid_body`: which entries of the rigid-body mass are stated.
+    `assumed`: sentences.
     """
 
     unit_mass: bool
@@ -111,12 +101,9 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
         if x is not None
         for name, z in zip(prior.labels, prior.numbers(x), strict=True)
     ]
-    reported = {id(one) for one in reported_unknowns(problem)}
     unknowns = [
-        ReportedUnknown(
-            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in reported
-        )
-        for one in reported_unknowns(problem, damping_ratios=True)
+        ReportedUnknown(one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), is_ratio)
+        for one, is_ratio in _reported_unknowns(formulation)
     ]
     return Facts(
         unit_mass=bool(problem.unit_mass),
@@ -138,16 +125,17 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
     )
 
 
-def reported_unknowns(problem: Prepared, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
-    """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
+def _reported_unknowns(formulation: Formulation) -> Iterator[tuple[Unknown, bool]]:
+    """Unknowns that mean something by themselves, and which are free damping ratios, that stand in the table of modes.
 
-    The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
-    stand in the table of modes, and are among them only where asked for.
+    Those of models with a form of their own, and variables, fixed too. The entries of a free matrix's factor are none,
+    nor are shares of which only the ratios count.
     """
-    formulation = problem.formulation
-    stated = (formulation.mass.free, formulation.stiffness.free, formulation.damping.free and not damping_ratios)
-    of_models = (v for group, free in zip(formulation.of_models, stated, strict=True) for v in group if not free)
-    return (*(v for v in of_models if not v.relative), *formulation.variables)
+    shown = (not formulation.mass.free, not formulation.stiffness.free, True)
+    ratios = (False, False, formulation.damping.free)
+    for group, among, are_ratios in zip(formulation.of_models, shown, ratios, strict=True):
+        yield from ((one, are_ratios) for one in group if among and not one.relative)
+    yield from ((one, False) for one in formulation.variables)
 
 
 def _models(problem: Prepared) -> Iterator[tuple[str, str]]:
@@ -197,15 +185,9 @@ class StoredRecords:
 class PartOfProblem:
     """Part of a problem in a file that does not hold it whole.
 
-    Attributes
-    ----------
-    tree, readings : dict
-        What `Problem.to_tree` and `sysid.results.readings` made.
-    records : Records
-    attributes : dict
-        All that readers of the result ask of the problem: attributes of `Answer` by their names.
-    without : str
-        Why the problem cannot be made of it, for a message.
+    `tree` and `readings` as `Problem.to_tree` and `sysid.results.readings` made them; `attributes` are those of
+    `Answer`, by name, for which readers ask the problem; `without` is why the problem cannot be made of it, for a
+    message.
     """
 
     tree: dict[str, Any]
@@ -213,3 +195,56 @@ class PartOfProblem:
     records: StoredRecords
     attributes: dict[str, Any]
     without: str
+
+
+def seconds_in_words(seconds: float) -> str:
+    """A time with two digits, or whole seconds: "0.031 s", "4.2 s", "123 s"."""
+    return f"{seconds:.2g} s" if not seconds >= 99.5 else f"{seconds:.0f} s"
+
+
+def rows_of_phases(problem: Prepared, history: History, structure: Structure, x: Array | None) -> list[list[str]]:
+    """A row of `COLUMNS` for each phase of the search that gave the answer; the truth's columns "-" without one.
+
+    Frequencies: largest relative error; MAC: of the mode that is told least; M_SS, K_SS and C: relative error in
+    Frobenius norm, "-" for C where the truth has no damping. An iterate of a local solver counts as a candidate. Of a
+    phase that ended at no structure, and of a result that tells no unknowns, only objectives are known.
+    """
+    rows = [_row(problem, phase, structure, x) for phase in history.phases if phase.x.size]
+    left = ("start", history.start), ("swarm", history.swarm), ("local phase", history.local)
+    plain = [(name, value) for name, value in left if np.isfinite(value)]
+    return rows or [[name, f"{value:.4g}", *["-"] * (len(COLUMNS) - 2)] for name, value in plain]
+
+
+def errors(found: Structure, truth: Structure) -> Array:
+    """Largest relative error of a frequency and largest 1 - MAC; relative errors of M_SS, K_SS and C: (5,)."""
+    ours, other = found.mode_shapes, truth.mode_shapes
+    squares, others = (np.einsum("ik,ik->k", phi, phi) for phi in (ours, other))  # zero for a shape that no sensor sees
+    mac = np.einsum("ik,ik->k", ours, other) ** 2 / np.where(squares > 0, squares, 1) / np.where(others > 0, others, 1)
+    return np.array([
+        np.max(np.abs(found.natural_frequencies / truth.natural_frequencies - 1)),
+        1 - mac.min(),
+        *matrix_errors(found, truth),
+    ])  # fmt: skip
+
+
+def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
+    """Relative errors of M_SS, K_SS and C in Frobenius norm; NaN of C where the truth has no damping."""
+    pairs = zip(system_matrices(found), system_matrices(truth), strict=True)
+    return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
+
+
+def _row(problem: Prepared, phase: Phase, answer: Structure, x: Array | None) -> list[str]:
+    truth = problem.stated.reference
+    # The graph of the matrices, which a hundred sensors cannot wait for, is not built for the answer itself.
+    answered = x is not None and np.array_equal(phase.x, x)
+    try:
+        structure = answer if answered else problem.structure(phase.x)
+    except (InputError, np.linalg.LinAlgError):
+        left = [f"{phase.objective:.4g}", "no structure", *["-"] * 5]
+        return [phase.name, *left, str(phase.evaluations), f"{phase.seconds:.1f}"]
+    known = truth is not None and truth.n == structure.n and truth.n_base == structure.n_base
+    off = errors(structure, truth) if known and truth is not None else np.full(5, np.nan)
+    of_truth = [f"{value:.2g}" if np.isfinite(value) else "-" for value in off * [100, 1, 100, 100, 100]]
+    residual = problem.screened.measurement.residual(structure) if problem.free_modes else problem.residual(phase.x)
+    objective = [f"{value:.4g}" for value in (phase.objective, residual)]
+    return [phase.name, *objective, *of_truth, str(phase.evaluations), f"{phase.seconds:.1f}"]

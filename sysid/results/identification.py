@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from itertools import starmap
 from pathlib import Path
@@ -182,7 +182,10 @@ class Identification(Answer):
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
-            "findings": [{**one._asdict(), "numbers": _finite(one.numbers)} for one in self.findings],
+            "findings": [
+                {**one._asdict(), "numbers": {name: _plain(np.array(z, float)) for name, z in one.numbers.items()}}
+                for one in self.findings
+            ],
             "outliers": [
                 {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
                 for o in self.outliers
@@ -209,10 +212,10 @@ class Identification(Answer):
             **{name: getattr(self, name) for name in _PLAIN},
             "structure": self.structure.to_tree(),
             **self._problem_to_tree(),
-            "seed": _if_given(str, self.seed),  # a number of any size
+            "seed": readings.if_given(str, self.seed),  # a number of any size
             "findings": [one.to_tree() for one in self.findings],
             "history": self.history.to_tree(),
-            "recipe": _if_given(Recipe.to_tree, self.recipe),
+            "recipe": readings.if_given(Recipe.to_tree, self.recipe),
         }
 
     def _problem_to_tree(self) -> dict[str, Any]:
@@ -233,10 +236,10 @@ class Identification(Answer):
             **{name: tree[name] for name in _PLAIN},
             structure=structure,
             problem=_problem_from_tree(tree, structure),
-            seed=_if_given(int, tree["seed"]),
+            seed=readings.if_given(int, tree["seed"]),
             findings=tuple(map(Finding.from_tree, tree["findings"])),
             history=History.from_tree(tree["history"]),
-            recipe=_if_given(Recipe.from_tree, tree["recipe"]),
+            recipe=readings.if_given(Recipe.from_tree, tree["recipe"]),
         )
 
     def save(self, path: str | Path) -> Path:
@@ -402,17 +405,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _plain(values: Array) -> Any:
-    """Numbers as lists of Python's, None for what is not finite."""
+    """A number, or lists of numbers, of Python's; None for what is not finite."""
     plain = values.astype(object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
-
-
-def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
-    """Figures by their names, None for what is not finite."""
-    return {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
-
-
-def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:
-    """Value by `convert`; None where there is none."""
-    return None if value is None else convert(value)

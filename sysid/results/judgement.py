@@ -41,7 +41,7 @@ class Verdict(NamedTuple):
 def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     context = Context(prepared, end, session.cut_short)
-    verdict = _verdict(context)
+    verdict = verdict_of(context)
     session.log(f"done: {verdict.message}")
     try:
         with within(session.left):
@@ -79,13 +79,8 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
         return it.with_findings((_NOT_JUDGED,))
 
 
-def verdict_of(problem: Prepared, end: Outcome) -> Verdict:
-    """Judge where a search ended: a fit or not."""
-    return _verdict(Context(problem, end))
-
-
-def _verdict(context: Context) -> Verdict:
-    """The same, by checks of the end of a search alone."""
+def verdict_of(context: Context) -> Verdict:
+    """Judge where a search ended, by checks of the end of a search alone: a fit or not."""
     found, end = [one for check in OF_THE_END for one in check(context)], context.end
     wrong = [str(one) for one in contradicting(found) if one.kind not in ("stopped", "no solution")]
     # What the solver says stands first where it did not succeed, else last.

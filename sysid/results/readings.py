@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.outliers import Outlier
 from sysid.problem.direct_response import Slopes
+from sysid.results.answer import Answer
 from sysid.results.facts import Facts
 from sysid.structure.structure import Array, Structure
-
-if TYPE_CHECKING:
-    from sysid.results.answer import Answer
 
 Tree = dict[str, Any]
 
@@ -43,21 +41,13 @@ def answer_to_tree(it: Answer) -> Tree:
         "open_masses": np.array(it.open_masses, dtype=np.int64),
         "scale_is_open": bool(it.scale_is_open),
         "is_one_of_many": bool(it.is_one_of_many) if it.asks_for_others else None,
-        "uncertainty": _if_given(_uncertainty_to_tree, it.quick_uncertainty),
-        "intervals": _if_given(lambda ends: {"mass": ends.mass, "stiffness": ends.stiffness}, it.quick_intervals),
+        "uncertainty": if_given(_uncertainty_to_tree, it.quick_uncertainty),
+        "intervals": if_given(lambda ends: {"mass": ends.mass, "stiffness": ends.stiffness}, it.quick_intervals),
     }
 
 
 def answer_from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
-    """Give attributes of an `Answer` by their names, without those that were not computed.
-
-    Parameters
-    ----------
-    tree : dict
-        What `answer_to_tree` made.
-    structure : Structure
-        The answer's.
-    """
+    """Give attributes of an `Answer` by name, of what `answer_to_tree` made; none that were not computed."""
     attributes = {
         "facts": Facts.from_tree(tree["facts"]),
         "residual": tree["residual"],
@@ -73,8 +63,8 @@ def answer_from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
         "open_masses": tuple(tree["open_masses"].tolist()),
         "scale_is_open": tree["scale_is_open"],
         "is_one_of_many": tree["is_one_of_many"],
-        "uncertainty": _if_given(lambda part: _uncertainty_from_tree(part, structure), tree["uncertainty"]),
-        "_intervals": _if_given(lambda part: Intervals(**part), tree["intervals"]),
+        "uncertainty": if_given(lambda part: _uncertainty_from_tree(part, structure), tree["uncertainty"]),
+        "_intervals": if_given(lambda part: Intervals(**part), tree["intervals"]),
     }
     return {name: value for name, value in attributes.items() if value is not None}
 
@@ -117,5 +107,6 @@ def _by_name(tree: list[Tree]) -> dict[str, Array]:
     return {one["name"]: one["value"] for one in tree}
 
 
-def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:
+def if_given(convert: Callable[[Any], Any], value: Any) -> Any:
+    """Value by `convert`; None where there is none."""
     return None if value is None else convert(value)

@@ -11,7 +11,7 @@ from sysid.assessment.sensitivity import system_matrices
 from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
 from sysid.results.answer import Answer
-from sysid.results.phases import COLUMNS, seconds_in_words
+from sysid.results.facts import COLUMNS, seconds_in_words
 from sysid.results.tables import (
     MANY,
     NOISE_COLUMNS,

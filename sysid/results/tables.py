@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks.bounds import sides_of
 from sysid.assessment.checks.model_error import LEVEL
+from sysid.assessment.checks.stated import sides_of
 from sysid.results.answer import Answer
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, LIKELY, ROUND_OFF

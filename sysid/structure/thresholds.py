@@ -29,6 +29,7 @@ NEGLIGIBLE = 1e-6  # relative difference up to which two results are one; relati
 UNEXPLAINED = 0.5  # relative residual above which a model explains nothing of the records
 AS_GOOD = 1.02  # times the misfit of another fit, up to which a fit is as good
 FREE = 1.05  # times what free residues leave at the same poles, up to which a fit is where it can be
+MENDED = 0.3  # of the misfit, that mended records may leave
 SAME_ANSWER = 1e-3  # of an unknown's or a matrix's size: answers nearer to each other are one
 OTHER_ANSWER = 1e-2  # of the same, from which two answers are two
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import sysid
-from sysid.assessment.checks.bounds import bounds_in_words, on_bounds, pressure, sides_of
+from sysid.assessment.checks.stated import bounds_in_words, on_bounds, pressure, sides_of
 
 FREQ = np.linspace(1.0, 12.0, 60)
 STRETCH = np.array([[1.0, 0.0], [-1.0, 1.0]])

@@ -21,7 +21,7 @@ from benchmarks.mistakes.changing import (
 )
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
-from sysid.assessment.checks.changing import Change, Seen, changes, changing
+from sysid.assessment.checks.model_error import Change, Seen, changes, changing
 from sysid.modal_analysis.stretches import stretches_of
 
 

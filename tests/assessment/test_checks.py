@@ -12,8 +12,7 @@ from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structu
 from sysid.assessment.checks import run
 from sysid.assessment.checks.against_records import records_of_fit
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.stated_mass import stated_masses
-from sysid.assessment.checks.stated_values import missed_values
+from sysid.assessment.checks.stated import missed_values, stated_masses
 from sysid.search.strategy import Outcome
 
 

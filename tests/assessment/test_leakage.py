@@ -8,7 +8,7 @@ import pytest
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid import Measurement, Structure, simulate
-from sysid.assessment.checks.leakage import leakage
+from sysid.assessment.checks.against_records import leakage
 
 SETTING = four_storeys()
 TRUTH = SETTING.structure

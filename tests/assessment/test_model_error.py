@@ -9,8 +9,8 @@ import sysid
 from benchmarks.mistakes.changing import RATE, motion, noisy
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
-from sysid.assessment.checks.changing import changing
-from sysid.assessment.checks.noise_multiples import BEYOND, misses_of, noise_at_most
+from sysid.assessment.checks.context import BEYOND, misses_of, noise_at_most
+from sysid.assessment.checks.model_error import changing
 from sysid.measurement.in_time import cut_in_motion, peaks, quiet_levels, runs_in_time
 
 

@@ -10,8 +10,9 @@ import pytest
 
 import sysid
 from sysid.cli.output import strict_json
-from sysid.compare import comparison, peers, table
-from sysid.compare.method_result import Status, errors_of
+from sysid.compare import peers
+from sysid.compare.comparison import Comparison, as_csv, compare, comparison_text
+from sysid.compare.peers import Status, errors_of
 from sysid.search.modal import Modal
 
 K = 4e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
@@ -34,7 +35,7 @@ def alone(monkeypatch):
 def compared():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(peers, "missing_packages", lambda: ["pymoo"])
-        return comparison.compare(two_masses(), rng=3)
+        return compare(two_masses(), rng=3)
 
 
 def test_every_strategy_has_a_row_and_the_one_that_refuses_its_own_reason(compared):
@@ -72,38 +73,38 @@ def test_errors_are_frobenius_norms_over_the_references_in_percent():
 def test_an_undamped_reference_leaves_no_relative_error_of_damping_and_says_so(compared):
     undamped = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.0, 0.0], n_base=1)
     np.testing.assert_allclose(errors_of(TRUTH, undamped), [0.0, 0.0, np.nan], atol=1e-9)
-    texts = [table.comparison_text(replace(compared, problem=two_masses(reference=one))) for one in (undamped, TRUTH)]
+    texts = [comparison_text(replace(compared, problem=two_masses(reference=one))) for one in (undamped, TRUTH)]
     assert ["no damping" in " ".join(words.split()) for words in texts] == [True, False]
 
 
 def test_a_comparison_without_results_is_a_head_without_rows(compared):
-    empty = comparison.Comparison(two_masses(), 0, None, ())
-    assert table.as_csv(empty).splitlines() == table.as_csv(compared).splitlines()[:1]
-    assert table.comparison_text(empty).startswith("method ")
+    empty = Comparison(two_masses(), 0, None, ())
+    assert as_csv(empty).splitlines() == as_csv(compared).splitlines()[:1]
+    assert comparison_text(empty).startswith("method ")
 
 
 def test_what_is_compared_is_the_residual_where_nothing_else_is_minimised(alone):
-    assert comparison.Comparison(two_masses(), 0, None, ()).quantity == "residual"
-    compared = comparison.compare(two_masses(noise=0.01), max_time=5.0)
+    assert Comparison(two_masses(), 0, None, ()).quantity == "residual"
+    compared = compare(two_masses(noise=0.01), max_time=5.0)
     assert compared.quantity == "objective"
-    assert " residual  " in table.comparison_text(compared)
-    assert "before, after: objective" in table.comparison_text(compared)
+    assert " residual  " in comparison_text(compared)
+    assert "before, after: objective" in comparison_text(compared)
 
 
 def test_the_table_has_a_line_a_method_and_no_errors_without_a_reference(compared):
-    head, *lines = table.comparison_text(compared).splitlines()
+    head, *lines = comparison_text(compared).splitlines()
     assert head.split() == ["method", "before", "after", "M,", "%", "K,", "%", "C,", "%", "evaluations", "seconds",
                             "status"]  # fmt: skip
     assert [line.split()[0] for line in lines[:3]] == ["modal", "continuation", "swarm"]
     assert lines[1].split()[1:8] == ["-"] * 7
     assert any(f"continuation: {compared.results[1].message}" in line for line in lines)
     assert max(map(len, (head, *lines))) <= 120
-    unknown = comparison.Comparison(two_masses(reference=None), 3, None, compared.results)
-    assert "%" not in table.comparison_text(unknown)
+    unknown = Comparison(two_masses(reference=None), 3, None, compared.results)
+    assert "%" not in comparison_text(unknown)
 
 
 def test_rows_go_to_csv_and_strict_json(compared):
-    rows = list(csv.DictReader(io.StringIO(table.as_csv(compared))))
+    rows = list(csv.DictReader(io.StringIO(as_csv(compared))))
     told = json.loads(strict_json(compared.to_dict()), parse_constant=pytest.fail)
     assert [row["method"] for row in rows] == [row["method"] for row in told["methods"]]
     for row, method, result in zip(rows, told["methods"], compared.results, strict=True):
@@ -119,7 +120,7 @@ def test_a_problem_that_every_strategy_refuses_is_told_with_all_reasons(alone, m
         monkeypatch.setattr(strategy, "refusal", lambda self, problem, start: f"no {self.name} today")
     told = "no strategy applies: modal: no modal today; continuation: no continuation today; swarm: no swarm today"
     with pytest.raises(sysid.InputError, match=told):
-        comparison.compare(two_masses())
+        compare(two_masses())
 
 
 @pytest.mark.parametrize("at", [0, 1])
@@ -131,8 +132,8 @@ def test_an_interrupted_comparison_keeps_what_was_finished(alone, monkeypatch, a
             raise KeyboardInterrupt
         return sysid.identify(problem, strategy=strategy, **options)
 
-    monkeypatch.setattr(comparison, "identify", identify)
-    compared = comparison.compare(two_masses(), listener=heard.append)
+    monkeypatch.setattr("sysid.compare.comparison.identify", identify)
+    compared = compare(two_masses(), listener=heard.append)
     assert compared.interrupted
     assert [result.name for result in compared.results] == ["modal", "continuation"][: 2 * at]
     assert heard == list(compared.results)
@@ -149,8 +150,8 @@ def test_a_method_that_was_interrupted_is_the_last(alone, monkeypatch):
 
         return real(problem, callback=stop, **options)
 
-    monkeypatch.setattr(comparison, "identify", identify)
-    compared = comparison.compare(two_masses())
+    monkeypatch.setattr("sysid.compare.comparison.identify", identify)
+    compared = compare(two_masses())
     assert compared.interrupted
     assert [result.status for result in compared.results] == [Status.FIT, Status.REFUSED, Status.INTERRUPTED]
     assert len(dict(compared.results[-1].phases)["swarm"]) == 3
@@ -158,5 +159,5 @@ def test_a_method_that_was_interrupted_is_the_last(alone, monkeypatch):
 
 def test_a_strategy_that_fails_is_a_row(alone, monkeypatch):
     monkeypatch.setattr(Modal, "run", lambda *given: (_ for _ in ()).throw(sysid.SolverError("nothing came out")))
-    failed = comparison.compare(two_masses()).results[0]
+    failed = compare(two_masses()).results[0]
     assert (failed.status, failed.message) == (Status.FAILED, "nothing came out")

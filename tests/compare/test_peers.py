@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid.compare import comparison, peers
-from sysid.compare.method_result import Recorder, Status
+from sysid.compare.peers import Recorder, Status
 from sysid.search.session import DeferredInterrupt, Session
 
 TRUTH = sysid.Structure(

@@ -5,7 +5,7 @@ import pytest
 
 import sysid
 from sysid.compare.comparison import Comparison
-from sysid.compare.method_result import MethodResult, Status
+from sysid.compare.peers import MethodResult, Status
 
 SWARM = (("swarm", np.array([[0.1, 0.5], [1.0, 0.2]])), ("local phase", np.array([[1.1, 1e-3], [1.2, 1e-9]])))
 TRUTH = sysid.Structure(np.diag([2.0, 0.5]), 4e3 * np.array([[1.0, -1.0], [-1.0, 1.0]]), [0.01], n_base=1)

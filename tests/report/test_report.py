@@ -16,8 +16,7 @@ import sysid
 from sysid.finding import Finding, Severity
 from sysid.report import opening, report
 from sysid.report.html import aligned
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY
-from sysid.report.opening import noise_of_test
+from sysid.report.opening import CHOSEN, ONE_OF_MANY, noise_of_test
 from sysid.results.summary import residual_in_words
 
 FREQ = np.linspace(1.0, 40.0, 30)

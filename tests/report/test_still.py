@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from sysid.report.still import ChannelSpectra, curve_sheet, degrees
+from sysid.report.curves import ChannelSpectra, curve_sheet, degrees
 
 NUMBER = r"-?[\d.]+"
 
@@ -17,10 +17,10 @@ def oscillator(freq, *, natural=10.0, ratio=0.01):
 
 
 def sheet(freq, measured, identified=None, **levels):
-    told = {"noise": None, "band": None} | {name: values[None] for name, values in levels.items()}
+    told = {"noise": None, "band": None} | levels
     identified = measured if identified is None else identified
-    channel = ChannelSpectra("tip", "transmissibility", "–", measured[None], identified[None], **told)
-    return curve_sheet("tip, base x", freq, channel, 0)
+    channel = ChannelSpectra("tip", "transmissibility", "–", measured, identified, **told)
+    return curve_sheet("tip, base x", freq, channel)
 
 
 def curves(drawing, kind):
@@ -107,8 +107,8 @@ def test_no_curve_is_joined_where_lines_were_left_out():
     freq = np.linspace(1.0, 20.0, 60)
     drawing = sheet(freq, oscillator(freq))
     assert not any(np.isnan(one).any() for one in curves(drawing, "identified"))
-    channel = ChannelSpectra("tip", "transmissibility", "–", oscillator(freq)[None], oscillator(freq)[None], None, None)
-    size, _ = curves(curve_sheet("tip", freq, channel, 0, [25]), "identified")
+    channel = ChannelSpectra("tip", "transmissibility", "–", oscillator(freq), oscillator(freq), None, None)
+    size, _ = curves(curve_sheet("tip", freq, channel, [25]), "identified")
     (gap,) = np.flatnonzero(np.isnan(size[:, 0]))
     across = scales(drawing)[0]
     np.testing.assert_allclose(across(size[[gap - 1, gap + 1], 0]), freq[24:26], rtol=0.01)

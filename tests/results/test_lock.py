@@ -11,21 +11,21 @@ from pathlib import Path
 import pytest
 
 from sysid import InputError
-from sysid.results import lock
-from sysid.results.lock import FILE_NAME, alone
+from sysid.results import storage
+from sysid.results.storage import LOCK_NAME, alone
 
 # Holds the lock in another process until it is killed, or its input ends.
 HOLDER = """
 import errno, sys
 from pathlib import Path
-from sysid.results import lock
+from sysid.results import storage
 
 def without(file):
     raise OSError(errno.ENOSYS, "no locks")
 
 if sys.argv[2] == "named":
-    lock._lock = without
-with lock.alone(Path(sys.argv[1]), "the folder", "wait"):
+    storage._lock = without
+with storage.alone(Path(sys.argv[1]), "the folder", "wait"):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -42,13 +42,13 @@ def kind(request, monkeypatch):
     if request.param == "named":
         if sys.platform == "win32":
             pytest.skip("Windows has locks on all file systems")
-        monkeypatch.setattr(lock, "_lock", without_locks)
+        monkeypatch.setattr(storage, "_lock", without_locks)
     return request.param
 
 
 @pytest.fixture
 def place(tmp_path):
-    return tmp_path / "some" / "folder" / FILE_NAME
+    return tmp_path / "some" / "folder" / LOCK_NAME
 
 
 def hold(place: Path):
@@ -118,10 +118,10 @@ def test_it_ends_with_its_process(place, kind):
 )
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="the system tells no process's begin")
 def test_a_named_owner_is_known_by_host_number_and_begin(place, monkeypatch, record, stale):
-    monkeypatch.setattr(lock, "_lock", without_locks)
-    host, pid, begun = lock._process_record().split()
+    monkeypatch.setattr(storage, "_lock", without_locks)
+    host, pid, begun = storage._process_record().split()
     place.parent.mkdir(parents=True)
-    named = place.with_name(f"{FILE_NAME}.owner")
+    named = place.with_name(f"{LOCK_NAME}.owner")
     named.write_text(record.format(host=host, pid=pid, begun=begun))
     if stale:
         with hold(place):
@@ -167,4 +167,4 @@ def test_of_many_at_once_never_two_hold_it(place, kind):
 def test_a_folder_that_cannot_be_written_is_told(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match=f"the folder cannot be written: {os.strerror(errno.EACCES)}"):
-        hold(tmp_path / FILE_NAME).__enter__()
+        hold(tmp_path / LOCK_NAME).__enter__()

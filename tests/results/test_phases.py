@@ -8,7 +8,7 @@ import pytest
 import sysid
 from sysid.report.report import render
 from sysid.results.answer import modal_assurance
-from sysid.results.phases import COLUMNS, errors, rows_of_phases, seconds_in_words
+from sysid.results.facts import COLUMNS, errors, seconds_in_words
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +51,16 @@ def test_a_mode_that_no_sensor_sees_agrees_with_none():
 def test_a_phase_that_ended_at_no_structure_says_so(result):
     nowhere = replace(result.history.phases[0], x=np.zeros(result.problem.n_variables))  # no mass at all
     history = replace(result.history, phases=(nowhere, *result.history.phases[1:]))
-    first, *others = rows_of_phases(replace(result, history=history))
+    first, *others = replace(result, history=history).phases
     cells = dict(zip(COLUMNS, first, strict=True))
     assert cells["residual"] == "no structure"
     assert cells["M, %"] == cells["1 - MAC"] == "-"
     assert cells["candidates"] == str(nowhere.evaluations)
-    assert others == rows_of_phases(result)[1:]
+    assert others == result.phases[1:]
 
 
 def test_each_phase_has_its_row_with_its_residual_and_errors(result):
-    rows = rows_of_phases(result)
+    rows = result.phases
     assert [row[0] for row in rows] == ["start", "swarm", "local phase"]
     assert all(len(row) == len(COLUMNS) for row in rows)
     last = dict(zip(COLUMNS, rows[-1], strict=True))
@@ -78,7 +78,7 @@ def test_phases_are_stored(result, tmp_path):
     path = tmp_path / "r.h5"
     result.save(path)
     again = sysid.load(path)
-    assert rows_of_phases(again) == rows_of_phases(result)
+    assert again.phases == result.phases
 
 
 def test_the_answer_is_told_without_building_it_again(random_case, monkeypatch):
@@ -86,7 +86,7 @@ def test_the_answer_is_told_without_building_it_again(random_case, monkeypatch):
     problem = random_case(np.random.default_rng(2), n=3, d=1)[1]
     result = sysid.identify(problem, strategy="modal", rng=0)
     monkeypatch.setattr(type(problem), "structure", lambda *given: pytest.fail("the matrices were built"))
-    assert [row[0] for row in rows_of_phases(result)] == ["local phase"]
+    assert [row[0] for row in result.phases] == ["local phase"]
 
 
 def test_seconds_are_neither_rounded_to_nothing_nor_written_with_a_power():

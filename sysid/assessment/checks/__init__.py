@@ -1,28 +1,43 @@
 """All checks of records and of fits: `CHECKS`, in the order of their weight.
 
 A check looks at a `Context` and yields findings; what it is about stands in the first line of its docstring, of which
-the table in docs/mistakes.md is made. Before a search there is no outcome, and checks of fits find nothing.
+the table in docs/mistakes.md is made. Before a search the records alone are looked at (`check_records`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from sysid.assessment.checks.against_records import records_of_fit
-from sysid.assessment.checks.bounds import bounds_explain, keeping_bounds, on_a_bound, pressed_bounds
-from sysid.assessment.checks.changing import changing_frequencies
+from sysid.assessment.checks.against_records import exchanged_sensors, records_of_fit
 from sysid.assessment.checks.context import Check, Context, Ended
-from sysid.assessment.checks.exchanged import exchanged_sensors
 from sysid.assessment.checks.gains import assumed_totals
-from sysid.assessment.checks.goal import missed_goal
-from sysid.assessment.checks.limits import lines_left_out, search_boxes, unfitted_records
-from sysid.assessment.checks.model_error import beyond_noise, other_levels, unpredicted_tests
-from sysid.assessment.checks.noise import noise_of_records
-from sysid.assessment.checks.outliers import numbers_far_off
-from sysid.assessment.checks.search_end import no_solution, search_notes, stopped, untried_modes
-from sysid.assessment.checks.stated_mass import stated_masses
-from sysid.assessment.checks.stated_values import missed_values
-from sysid.assessment.checks.wrong_records import wrong_records
+from sysid.assessment.checks.mistakes import mistakes_before_search, wrong_records
+from sysid.assessment.checks.model_error import (
+    beyond_noise,
+    changing_frequencies,
+    noise_of_records,
+    numbers_far_off,
+    other_levels,
+    unpredicted_tests,
+)
+from sysid.assessment.checks.search_end import (
+    lines_left_out,
+    missed_goal,
+    no_solution,
+    search_boxes,
+    search_notes,
+    stopped,
+    unfitted_records,
+    untried_modes,
+)
+from sysid.assessment.checks.stated import (
+    keeping_bounds,
+    missed_values,
+    on_a_bound,
+    pressed_bounds,
+    pressure_of,
+    stated_masses,
+)
 from sysid.errors import refuse
 from sysid.finding import Finding, Severity
 from sysid.problem.prepared import Prepared
@@ -72,12 +87,12 @@ def check_records(problem: Prepared) -> tuple[Finding, ...]:
     InputError
         Where one is blocking, so that a search would be in vain.
     """
-    found = tuple(run(Context(problem)))
+    found = tuple(mistakes_before_search(problem))
     refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
     return found
 
 
 def mistakes_of_poor_fit(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
     """Sensors that were swapped, where that explains what a search leaves, so that no other would do better."""
-    pressed = bounds_explain(problem, end.structure, end.x)  # what they leave may look like swapped sensors
-    return exchanged_sensors(problem, end.structure, wholly=pressed)
+    _, pressed = pressure_of(problem, end)  # what bounds leave may look like swapped sensors
+    return exchanged_sensors(problem, end.structure, wholly=pressed.explains)

@@ -4,27 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, of_tests
 from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
-from sysid.assessment.checks.leakage import leakage
-from sysid.assessment.checks.stated_mass import MISFIT, force_misfit
+from sysid.assessment.checks.stated import MISFIT, force_misfit
+from sysid.errors import InputError
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.residues import Records, ResidueFit
+from sysid.modal_analysis.residues import Records, ResidueFit, linear_residues
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
+from sysid.structure.thresholds import CANDIDATES, EXACT, FREE, MENDED, NEGLIGIBLE, beyond_chance
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
+_SAME_SHAPE = 0.95  # modal assurance criterion
+_FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
+_RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
+_TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
+_MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
+_NEAR = 1.5  # half-power widths, or distances of lines, about a peak
+_CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
+_FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
 def records_of_fit(context: Context) -> Iterator[Finding]:
@@ -34,9 +46,8 @@ def records_of_fit(context: Context) -> Iterator[Finding]:
     problem, end = context.problem.screened, context.end
     formulation, changing = problem.formulation, context.has("changing")
     fits = problem.fits(end.structure, end.x)
-    for i, (modal, its) in enumerate(fits, start=1):
-        found = [one for one in _of_records(formulation, modal, its, changing) if one not in context.found]
-        yield from found if len(fits) == 1 else [one.of_test(i) for one in found]
+    found = [_of_records(formulation, modal, its, changing) for modal, its in fits]
+    yield from of_tests([[one for one in of_one if one not in context.found] for of_one in found])
 
 
 def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Structure, changing: bool) -> list[Finding]:
@@ -85,25 +96,19 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
+    possible, whose, figure = float(np.sqrt(free.squared_error / records.size)), "its poles", "free residues"
+    wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
+    if misfit <= MISFIT * max(possible, EXACT):
+        poles = None if formulation.free_modes else PolesAndResidues.of(test)
+        possible = np.inf if poles is None else poles.of_accelerations
+        whose, figure = "the poles of the data", "poles of the data"
+        wrong = "the form of its mass, stiffness or damping, recovery, or a bound is not the structure's"
+    possible = max(possible, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
-            f"{misses}, its poles with free residues {100 * possible:.3g} %: the model, a sign or axis in rigid_body, "
-            "or a record is not what it is said to be",
-            numbers={"misfit": misfit, "free residues": possible},
-        )  # fmt: skip
-        return
-    poles = None if formulation.free_modes else PolesAndResidues.of(test)
-    if poles is None:
-        return
-    possible = max(poles.of_accelerations, EXACT)
-    if misfit > MISFIT * possible:
-        yield Finding(
-            "misfit", Severity.CONTRADICTS,
-            f"{misses}, the poles of the data with free residues {100 * possible:.3g} %: the form of its mass, "
-            "stiffness or damping, recovery, or a bound is not the structure's",
-            numbers={"misfit": misfit, "poles of the data": possible},
+            f"{misses}, {whose} with free residues {100 * possible:.3g} %: {wrong}",
+            numbers={"misfit": misfit, figure: possible},
         )  # fmt: skip
 
 
@@ -212,3 +217,192 @@ def _smooth(power: Array, lines: int = 11) -> Array:
     from scipy.ndimage import uniform_filter1d
 
     return np.asarray(uniform_filter1d(power, lines, mode="nearest"))
+
+
+class Peaks(NamedTuple):
+    """Modes within the lines: numbers as users count them, Hz, half-power widths and distances of lines there, Hz."""
+
+    number: NDArray[np.intp]
+    frequency: Array
+    width: Array
+    spacing: Array
+
+
+def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
+    """Lines are too coarse for the modes that were found, and modes that may be none.
+
+    Averages over segments (`Measurement.averaged`) are judged by their lines alone. Frequency response functions of
+    unknown origin may be exact at any lines, so that they must miss more at the peak than elsewhere. Spectra of whole
+    records are no averages, and never judged.
+    """
+    if test.freq.size < 2 or not (test.averaged or test.has_unit_runs):
+        return
+    peaks = _peaks(test, structure)
+    coarse = peaks.spacing * _FEWEST > peaks.width
+    averaged = "" if test.averaged else "if these spectra are averages over segments, "
+    groups = _found_twice(peaks, coarse, structure)
+    if groups:
+        of_groups = ", ".join(" and ".join(f"{f:.4g}" for f in peaks.frequency[group]) for group in groups)
+        most = np.max(peaks.spacing[[group[0] for group in groups]])
+        yield Finding(
+            "one mode twice", Severity.CONTRADICTS,
+            f"modes at {of_groups} Hz have the same shape, and lines are up to {most:.2g} Hz apart: {averaged}one mode "
+            "found twice is leakage of segments that are too short, no second mode",
+            numbers={"frequency": float(peaks.frequency[groups[0][0]]), "spacing": float(most)},
+        )  # fmt: skip
+    if not np.any(coarse):
+        return
+    k = int(np.argmax(np.where(coarse, peaks.spacing / peaks.width, 0.0)))
+    missed = "" if test.averaged else _missed(test, structure, float(peaks.frequency[k]), float(peaks.width[k]))
+    if missed is None:
+        return
+    seconds = _FEWEST / float(peaks.width[k])
+    yield Finding(
+        "coarse lines", Severity.CONTRADICTS,
+        f"lines are {peaks.spacing[k]:.2g} Hz apart, mode {peaks.number[k]} is {peaks.width[k]:.2g} Hz wide{missed}: "
+        f"{averaged}their window flattens its peak, and damping and masses come out wrong",
+        f"take whole records (from_time with estimator='records'), or segments of {seconds:.3g} s or longer",
+        numbers={
+            "mode": float(peaks.number[k]), "spacing": float(peaks.spacing[k]), "width": float(peaks.width[k]),
+            "seconds": seconds,
+        },
+    )  # fmt: skip
+
+
+def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
+    """Averages over segments have too few lines in most peaks of poles found in them, in rad/s and ratios, (m,) each.
+
+    Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
+    peak about one and a half distances of lines wide.
+    """
+    f = omega / (2 * np.pi)
+    inside = (f >= test.freq[0]) & (f <= test.freq[-1])
+    if not test.averaged or test.freq.size < 2 or not np.any(inside):
+        return
+    f, width = f[inside], 2 * ratios[inside] * f[inside]
+    spacing = np.interp(f, test.freq, np.gradient(test.freq))
+    k = int(np.argmax(spacing / width))
+    if 2 * np.count_nonzero(width < _RESOLVED * spacing) >= f.size:
+        yield Finding(
+            "short segments", Severity.CONTRADICTS,
+            f"the segments are too short: lines are {spacing[k]:.2g} Hz apart ({1 / spacing[k]:.3g} s a segment), and "
+            f"the peak at {f[k]:.4g} Hz is no wider than their window makes any peak, so that damping and masses are "
+            "the window's",
+            "take whole records (from_time with estimator='records'), or segments several times as long",
+            numbers={"spacing": float(spacing[k]), "frequency": float(f[k])},
+        )  # fmt: skip
+
+
+def _peaks(test: Measurement, structure: Structure) -> Peaks:
+    """Modes within the lines."""
+    freq, f = test.freq, structure.natural_frequencies
+    inside = np.flatnonzero((f >= freq[0]) & (f <= freq[-1]))
+    width = 2 * structure.damping_ratios[inside] * f[inside]
+    return Peaks(inside + 1, f[inside], width, np.interp(f[inside], freq, np.gradient(freq)))
+
+
+def _found_twice(peaks: Peaks, coarse: NDArray[np.bool_], structure: Structure) -> list[list[int]]:
+    """Groups of modes of one shape, each within two distances of lines from the next."""
+    groups: list[list[int]] = []
+    for i, j in pairwise(range(peaks.number.size)):
+        near = peaks.frequency[j] - peaks.frequency[i] < _TWICE * peaks.spacing[i]
+        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > _SAME_SHAPE):
+            continue
+        if groups and groups[-1][-1] == i:
+            groups[-1].append(j)
+        else:
+            groups.append([i, j])
+    return groups
+
+
+def _mac(structure: Structure, i: int, j: int) -> float:
+    """Modal assurance criterion of two modes at the sensors, 0 to 1."""
+    a, b = (structure.mode_shapes[:, [i, j]]).T
+    return float((a @ b) ** 2 / max((a @ a) * (b @ b), np.finfo(float).tiny))
+
+
+def _missed(test: Measurement, structure: Structure, frequency: float, width: float) -> str | None:
+    """Misfit of a fit about a peak, in words; None where that is no more than elsewhere.
+
+    Noise as large at all lines is less of the response at a peak, noise in proportion to it the same: only a peak
+    itself that is not what modes make of it stands out.
+    """
+    distance = np.gradient(test.freq)
+    near = np.abs(test.freq - frequency) < _NEAR * np.maximum(width, distance)
+    if not np.any(near) or np.all(near):
+        return None
+    left = test.relative - test.predict(structure)
+    share = lambda at: float(np.linalg.norm(left[..., at]) / np.linalg.norm(test.relative[..., at]))  # noqa: E731
+    there, elsewhere = share(near), share(~near)
+    if there < _MISSED * elsewhere or there < NEGLIGIBLE:
+        return None
+    return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"
+
+
+def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
+    """Two sensors that stand in each other's place, by the best fit to the records; none where the model cannot tell.
+
+    `wholly`: the exchange must leave no more than free residues do, as there is another cause of the misfit.
+    """
+    formulation, test = problem.formulation, problem.measurement
+    distinguishable = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
+    pairs = list(_alike(test))
+    if not distinguishable or not 0 < len(pairs) <= 15:  # those of six sensors
+        return ()
+    try:
+        omega, ratios = problem.geometry.poles.omega, problem.geometry.poles.ratios
+        found = [(_residual_of(problem, omega, ratios, pair), pair) for pair in pairs]
+        floor = linear_residues(test, omega, ratios)[1]
+    except (InputError, np.linalg.LinAlgError):
+        return ()
+    found.sort()
+    (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
+    kept = test.residual(structure)
+    if least > MENDED * kept or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
+        return ()
+    names = test.sensor_names
+    swapped = Finding(
+        "swapped sensors", Severity.CONTRADICTS,
+        f"{names[i]} and {names[j]} are swapped: the model misses {100 * kept:.3g} % of the accelerations as they are, "
+        f"and {100 * least:.3g} % with these two in each other's place",
+        "exchange their records, or their names", channel=names[i],
+        numbers={"sensor": float(i), "other": float(j), "residual": kept, "residual exchanged": least},
+    )  # fmt: skip
+    return (swapped,)
+
+
+def _alike(test: Measurement) -> Iterator[tuple[int, int]]:
+    """Pairs of sensors that move alike with the base."""
+    for i, j in combinations(range(test.n_sensors), 2):
+        if np.allclose(test.rigid_body[i], test.rigid_body[j]):
+            yield i, j
+
+
+def _residual_of(problem: Prepared, omega: Array, ratios: Array, pair: tuple[int, int]) -> float:
+    """Relative residual of the records with two sensors exchanged, fitted by poles and residues alone."""
+    from scipy.optimize import least_squares
+
+    test, formulation = problem.measurement, problem.formulation
+    order = np.arange(test.n_sensors)
+    order[list(pair)] = pair[::-1]
+    test = replace(test, response=test.response[:, order])
+    residues, _ = linear_residues(test, omega, ratios)
+    size, count = np.linalg.norm(residues), min(omega.size, test.n_sensors)
+    lower, upper = formulation.lower, formulation.upper
+    in_log = (lower > 0) & (upper > 10 * lower)
+    to = lambda x: np.where(in_log, np.log(np.where(in_log, x, 1.0)), x)  # noqa: E731
+    back = lambda z: np.clip(np.where(in_log, np.exp(np.where(in_log, z, 0.0)), z), lower, upper)  # noqa: E731
+
+    def errors(z: Array) -> Array:
+        s = formulation.matrices.structure(back(z), test)
+        w, zeta = 2 * np.pi * s.natural_frequencies[:count], s.damping_ratios[:count]
+        modelled = np.einsum("nk,kd->knd", s.mode_shapes[:, :count], s.participation[:count])
+        return np.concatenate([
+            ((modelled - residues[:count]) / size).ravel(), _FREQUENCY * np.log(w / omega[:count]),
+            _DAMPING * np.log(zeta / ratios[:count]),
+        ])  # fmt: skip
+
+    low, high = to(lower), to(upper)
+    start = np.clip(to(formulation.guess), low, high)
+    end = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), x_scale=high - low + 1e-12, max_nfev=40)
+    return test.residual(formulation.matrices.structure(back(end.x), test))

@@ -160,7 +160,7 @@ def assumed(problem: Prepared) -> Iterator[Finding]:
 
 def assumed_totals(context: Context) -> Iterator[Finding]:
     """A stated total of a lumped mass is taken to sit at the sensors."""
-    yield from () if context.outcome is None else taken_at_sensors(context.problem)
+    yield from taken_at_sensors(context.problem)
 
 
 def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
@@ -183,12 +183,8 @@ def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
     """By how many of its deviations the diagonal of M_SS moves at most where it moves by `by_gain`, (n_sensors,).
 
-    Parameters
-    ----------
-    by_gain : (n_sensors, m)
-        Moves of the diagonal that an error of each sensor's gain makes.
-    mass_std : (m, m)
-        What is stated exactly does not move; NaN where all that is not stated is open.
+    `by_gain` (n_sensors, m) is what an error of each sensor's gain makes. Of `mass_std` (m, m) what is stated exactly
+    does not move; it is NaN where all that is not stated is open.
     """
     std = np.diag(mass_std)
     known = std > 0

@@ -13,15 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.assessment.checks.against_records import unresolved
+from sysid.assessment.checks.context import Context, of_tests
+from sysid.assessment.checks.stated import wrong_statements
+from sysid.errors import InputError
 from sysid.files.units import STANDARD_GRAVITY
 from sysid.finding import Finding, Kind, Severity
+from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
+from sysid.modal_analysis.rough_poles import poles_of_test
+from sysid.problem.formulation import Formulation
+from sysid.problem.prepared import Prepared
+from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import AS_GOOD, CANDIDATES, most_deviations
+from sysid.structure.thresholds import AS_GOOD, CANDIDATES, MENDED, most_deviations
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
-MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
 _ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
 _LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
@@ -51,15 +59,9 @@ def is_gross(mistake: Finding) -> bool:
 
 
 def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
-    """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell.
+    """Mistakes that a test shows by itself and its direct terms, the worst first; none where it cannot tell.
 
     Those that spoil all channels are blocking.
-
-    Parameters
-    ----------
-    test : Measurement
-    terms : DirectTerms or None
-        Of the test, as `direct_terms` gives them.
     """
     if terms is None:
         return []
@@ -369,3 +371,42 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
             "give the force of the base on the structure, in phase with the base's acceleration at low frequency",
             numbers={f"weighed {i + 1}": float(weighed[i]) for i in against},
         )  # fmt: skip
+
+
+def wrong_records(context: Context) -> Iterator[Finding]:
+    """Records, or what is stated of them, are wrong by a sign, a unit, a delay, a swapped sensor."""
+    yield from context.named
+
+
+def mistakes_before_search(prepared: Prepared) -> Iterator[Finding]:
+    """Mistakes that the records of a problem show before a search.
+
+    Blocking where it spoils all channels, or a channel of a problem whose model has a form of its own, so that a
+    search would be in vain.
+    """
+    problem, declared = prepared.stated, prepared.stated.declared
+    tests = [problem.measurement] if problem.misfit is None else []
+    tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
+    found = [_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests]
+    for one in of_tests(found):
+        in_vain = is_gross(one) and not declared.free_modes
+        yield one._replace(severity=Severity.BLOCKING) if in_vain else one
+
+
+def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
+    try:
+        terms = direct_terms(test)
+        found = mistakes_of(test, terms)
+        if found and terms is not None and terms.misfit <= CONJUGATED and not test.is_whole:
+            # Of records cut in motion, transients that were left in look like delays and gains.
+            test = as_whole(test)
+            if test.is_whole:
+                terms = direct_terms(test)
+                found = mistakes_of(test, terms)
+        if first and not found and terms is not None:
+            found = list(wrong_statements(problem, declared, test, terms))
+        if not found and test.averaged:
+            found = list(unresolved(test, *poles_of_test(test)))
+    except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
+        return []
+    return found
