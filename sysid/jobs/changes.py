@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, as_float, whole_number
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.residues import independent
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness import SpectralStiffness
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem

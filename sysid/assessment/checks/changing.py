@@ -15,9 +15,9 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import levels_are_known
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.stretches import Stretch, stretches_of
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations

@@ -12,7 +12,7 @@ from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.noise_multiples import BEYOND
 from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import peaks
-from sysid.modal_analysis.transients import without_transients_of
+from sysid.modal_analysis.misfit import without_transients_of
 
 LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 _CUT = (
