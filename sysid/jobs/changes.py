@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, as_float, refuse, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records
+from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records, without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import independent
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness_and_damping import SpectralStiffness
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.pole_functions import unit_columns
+from sysid.modal_analysis.pole_functions import factorised, unit_columns
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
@@ -146,7 +146,7 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     """Linear least squares on given poles; the slopes per rad/s."""
     direct = records.basis(_without_poles(records.freq), records.driven)
     functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True).dense()]))
-    Q, R = np.linalg.qr(functions)
+    Q, R = factorised(functions)
     answered = Q.T @ records.data
     left = records.data - Q @ answered
     inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]

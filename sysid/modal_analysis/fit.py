@@ -27,13 +27,17 @@ from sysid.modal_analysis.record_fit import (
     refitted,
     without,
 )
-from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_spread import scatter
-from sysid.modal_analysis.rest_test import runs_in_motion
+from sysid.modal_analysis.residual_tests import (
+    excess_of,
+    gain_errors_of,
+    runs_in_motion,
+    scatter,
+    unidentifiable_levels,
+    varying_levels,
+    with_varying_levels,
+)
 from sysid.modal_analysis.rough_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
-from sysid.modal_analysis.varying_levels import unidentifiable_levels, varying_levels, with_varying_levels
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
-from sysid.modal_analysis.whiteness_test import excess_of
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 

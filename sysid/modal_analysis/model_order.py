@@ -23,7 +23,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Lines, dots
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
-from sysid.modal_analysis.record_spread import line_blocks, uneven
+from sysid.modal_analysis.residual_tests import line_blocks, uneven
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.modal_analysis.modal_model import base_noise, dots
-from sysid.modal_analysis.noise_spectrum import designs
-from sysid.modal_analysis.record_model import Parameters, RecordModel
+from sysid.modal_analysis.record_model import Parameters, RecordModel, designs
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE
 

@@ -162,6 +162,24 @@ def unit_columns(matrix: Array) -> tuple[Array, Array]:
     return matrix / size, size
 
 
+def factorised(columns: Array) -> tuple[Array, Array]:
+    """Orthonormal basis Q and triangle R of ``columns = Q R``, (rows, k), several times as fast as by reflections.
+
+    By Cholesky's factor of their products, twice (Fukaya et al., ScalA 2014, 31-38), unless the columns are so nearly
+    dependent that what the first factor leaves is far from orthonormal.
+    """
+    Q, R = columns, np.eye(columns.shape[1])
+    for again in (False, True):
+        products = Q.T @ Q
+        far = again and np.linalg.norm(products - np.eye(len(products))) > 0.5
+        factor, failed = scipy.linalg.lapack.dpotrf(products)
+        if far or failed:
+            Q, R = np.linalg.qr(columns)
+            break
+        Q, R = Q @ scipy.linalg.lapack.dtrtri(factor)[0], factor @ R
+    return Q, R
+
+
 def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
     """Basis of the functions, the triangle R (columns, columns) of their factorisation, and sizes of the columns.
 
@@ -186,7 +204,7 @@ def orthonormal(functions: PoleFunctions) -> tuple[Basis, Array, Array]:
             crossing += share
         shared[rows] = here
         across.append(crossing)
-    Q, R = np.linalg.qr(shared)
+    Q, R = factorised(shared)
     first = sum(map(len, triangles))
     triangle = scipy.linalg.block_diag(*triangles, R)
     if across:

@@ -20,11 +20,16 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
-from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.noise_levels import floors, likeliest_levels
-from sysid.modal_analysis.noise_spectrum import extra_numbers
-from sysid.modal_analysis.record_model import TRACES, HeldShapes, NormalEquations, Parameters, RecordModel
+from sysid.modal_analysis.record_model import (
+    TRACES,
+    HeldShapes,
+    NormalEquations,
+    Parameters,
+    RecordModel,
+    extra_numbers,
+)
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
 

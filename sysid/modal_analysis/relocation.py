@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sysid.modal_analysis.pole_functions import unit_columns
+from sysid.modal_analysis.pole_functions import factorised, unit_columns
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
@@ -37,7 +37,7 @@ def relocate(
         tell()
         functions = [(numerators[:, None] * base).reshape(-1, w.size), (g[:, None] * ends).reshape(-1, w.size)]
         basis, _ = unit_columns(stacked(np.concatenate(functions)))
-        bases.append(np.linalg.qr(basis)[0])
+        bases.append(factorised(basis)[0])
     rows = _rows_by_squares(blocks, bases, sigma, tell)
     if rows is None:
         rows = _rows_by_factors(blocks, bases, sigma, tell)
@@ -72,7 +72,7 @@ def _rows_by_squares(
     the numerators fit. Its least eigenvalue is the share of noise in ``|sigma a|²``, however close the poles.
     """
     size = np.sqrt(sum(np.sum(np.abs(channels) ** 2, axis=0) for *_, channels in blocks))
-    U, triangle = np.linalg.qr(stacked(size * sigma))
+    U, triangle = factorised(stacked(size * sigma))
     G = np.eye(len(triangle))
     share = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     functions = _as_rows(U)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import ModalFit, Modes
-from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles

@@ -355,33 +355,38 @@ def _polish(
     """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
-    damping = 1e-3
-    error, H, slope = _projected(records, p, velocity)
+    damping, failed = 1e-3, np.array(np.inf)  # the step from here that failed last
+    fit = records.fit(omega, ratios, velocity=velocity)
+    H, slope = _projected(records, p, fit, velocity)
     for _ in range(steps):
+        error = fit.squared_error
         progress.step(error)
         if error < round_off(len(records.data)) ** 2 * records.size:
             break
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
-        trial = p + np.clip(step, -0.5, 0.5)
-        trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
-        lower, *model = _projected(records, trial, velocity)
-        if lower < error:
-            done = error - lower < NEGLIGIBLE * error
-            p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
-            if done:
-                break
-        else:
+        step = np.clip(np.linalg.solve(H + damping * np.diag(np.diag(H)), slope), -0.5, 0.5)
+        if np.linalg.norm(step - failed) < 1e-3 * np.linalg.norm(step):
             damping *= 10
+            continue
+        trial = p + step
+        trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
+        other = records.fit(*np.exp(trial.reshape(2, m)), velocity=velocity)
+        if other.squared_error < error:
+            p, fit, damping = trial, other, max(damping / 10, 1e-12)
+            if error - fit.squared_error < NEGLIGIBLE * error:
+                break
+            H, slope = _projected(records, p, fit, velocity)
+            failed = np.array(np.inf)
+        else:
+            failed, damping = step, 10 * damping
             if damping > 1e6:
                 break
     return np.exp(p[:m]), np.exp(p[m:])
 
 
-def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array, Array]:
-    """Squared error, Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at log poles `p`."""
+def _projected(records: Records, p: Array, fit: ResidueFit, velocity: bool) -> tuple[Array, Array]:
+    """Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at the `fit` on log poles `p`."""
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])
-    fit = records.fit(omega, ratios, velocity=velocity)
     by_pole = gain_slopes(records.freq, omega, ratios)[:, None]
     if velocity:
         turn = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None]
@@ -393,4 +398,4 @@ def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array
     d = slopes.per_pole
     H = (beside.gram() * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
     slope = np.sum(products * residues, axis=1).reshape(2 * m, d).sum(axis=1)
-    return fit.squared_error, H, slope
+    return H, slope

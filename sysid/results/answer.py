@@ -24,10 +24,10 @@ from sysid.finding import (
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.fit import estimate, fit_modes
+from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, screened
 from sysid.modal_analysis.response import weighted_error
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.unknowns import by_name
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem

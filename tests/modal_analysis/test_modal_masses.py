@@ -7,8 +7,7 @@ import pytest
 
 import sysid
 from benchmarks.modal.random_structures import random_structure
-from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.modal_fit import Modes, weigh
 
 
 def _test(seed, lowest, highest):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.modal_analysis.pole_functions import orthonormal
+from sysid.modal_analysis.pole_functions import factorised, orthonormal
 from sysid.modal_analysis.residues import Records, SubsetFits
 from sysid.modal_analysis.vector_fitting import _projected
 
@@ -72,7 +72,7 @@ def test_the_basis_is_orthonormal_and_factorises_the_functions(test, velocity):
 def test_the_step_of_all_poles_is_that_of_the_derivative_of_the_projection(test, velocity):
     """Gradient by central differences of the squared error; the matrix is Kaufman's, from columns written out."""
     records, p, h = Records(test), np.log(np.concatenate(POLES)), 1e-6
-    _, H, slope = _projected(records, p, velocity)
+    H, slope = _projected(records, p, records.fit(*POLES, velocity=velocity), velocity)
 
     def error(q):
         return records.fit(np.exp(q[:3]), np.exp(q[3:]), velocity=velocity).squared_error
@@ -89,6 +89,18 @@ def test_the_step_of_all_poles_is_that_of_the_derivative_of_the_projection(test,
         J.append((change - Q @ (Q.T @ change)).ravel())
     J = np.array(J)
     np.testing.assert_allclose(H, J @ J.T, rtol=1e-5, atol=1e-6 * np.abs(H).max())
+
+
+@pytest.mark.parametrize("apart", [1.0, 1e-6, 1e-12, 0.0])
+def test_columns_however_close_have_an_orthonormal_basis(apart):
+    """The second is so far from the first, relative: the two products alone would lose the difference from 1e-8 on."""
+    A = np.random.default_rng(0).standard_normal((60, 5))
+    A[:, 1] = A[:, 0] + apart * A[:, 1]
+    Q, R = factorised(A)
+    np.testing.assert_allclose(Q.T @ Q, np.eye(5), atol=1e-14)
+    np.testing.assert_allclose(Q @ R, A, atol=1e-13)
+    assert np.all(np.tril(R, -1) == 0)
+    np.testing.assert_allclose(np.abs(np.diag(R)), np.abs(np.diag(np.linalg.qr(A)[1])), rtol=1e-3, atol=1e-14)
 
 
 def test_other_columns_are_projected(test):

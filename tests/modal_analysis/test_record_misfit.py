@@ -13,7 +13,7 @@ from sysid.modal_analysis.fit import estimate
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.model_order import with_further_modes, without_spurious_modes
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
-from sysid.modal_analysis.record_spread import line_blocks, scatter_over_blocks
+from sysid.modal_analysis.residual_tests import line_blocks, scatter_over_blocks
 from sysid.structure.structure import Array
 
 RATE, SAMPLES, FINE, STEADY = 50.0, 3000, 8, 30.0  # Hz, of records; samples; finer steps; s of a steady sine

@@ -9,8 +9,7 @@ import sysid
 from benchmarks.records.simulated import Records, four_storeys
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.record_fit import record_modes, refitted
-from sysid.modal_analysis.varying_levels import unidentifiable_levels
-from sysid.modal_analysis.whiteness_test import most_unlikely
+from sysid.modal_analysis.residual_tests import most_unlikely, unidentifiable_levels
 from sysid.structure.thresholds import FALSE_ALARM
 
 SETTING = four_storeys()

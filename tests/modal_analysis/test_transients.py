@@ -10,7 +10,7 @@ import pytest
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from sysid import simulate
 from sysid.measurement.whole import WholeRecords
-from sysid.modal_analysis.transients import without_transients_of
+from sysid.modal_analysis.misfit import without_transients_of
 
 
 @pytest.mark.parametrize("at_rest", [True, False])

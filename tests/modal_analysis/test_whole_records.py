@@ -8,7 +8,7 @@ import pytest
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import whole_fit
-from sysid.modal_analysis.record_gains import gain_errors_of
+from sysid.modal_analysis.residual_tests import gain_errors_of
 from sysid.modal_analysis.rough_poles import decimated_lines
 from sysid.structure.structure import Structure
 

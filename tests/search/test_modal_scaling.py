@@ -6,8 +6,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.modal_analysis.modal_fit import ModalFit, Modes
-from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, weigh
 from sysid.modal_analysis.response import weighted_error
 from sysid.nlp import IterationMonitor
 from sysid.search.modal import held_to_totals

@@ -16,10 +16,10 @@ from sysid.measurement.in_time import levels_are_known, peaks
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import HUBER
 from sysid.modal_analysis.stretches import Stretch, stretches_of
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations

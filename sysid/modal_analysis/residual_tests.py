@@ -1,0 +1,339 @@
+"""Tests of what a fit of whole records leaves: levels of noise, the scatter of the modes, runs in motion, gains.
+
+Noise: what the errors of all channels tell of that of one, over its deviation, is complex white noise of variance one
+where model and levels are right. Its power over k lines is then a gamma variable of k, which any band may exceed by
+chance: all bands of 8, 16, 32 ... lines, each begun half a band after the other, of all channels and runs are
+counted together.
+
+Scatter: model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error:
+what its score would move the modes by, in one linear step from the end of the fit. The fit has taken a part of each
+block's errors: of white noise, a block with the share H of the information leaves a score of covariance ``H (I - H)``.
+The score over the root of ``I - H`` has H again, so that the squares of all moves make the covariance without bias
+(White 1982; MacKinnon and White 1985, HC2, a block in the place of a number). The whole ``I - H``, HC3, is the
+jackknife, which is too wide: a block may hold most of what tells a mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
+from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.record_model import Chunk, Parameters, RecordModel, Run
+from sysid.structure.structure import Array
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
+
+_FEWEST = 8  # lines of a band
+_UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
+_TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
+
+
+def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
+    """Channels with more than their noise in a band, each its most significant band, the most significant first."""
+    powers = noise_powers(fit)
+    model, test = fit.model, fit.test
+    bands = sum(_count(power.shape[1]) * len(power) for power in powers)
+    found: list[tuple[float, Excess]] = []
+    levels = np.sqrt(fit.levels_of_runs)
+    for number, (lines, power) in enumerate(zip(test.own_lines, powers, strict=True)):
+        freq, runs = test.freq[lines], [run for run in model.runs if run.number == number]
+        both = np.concatenate([np.vstack([run.outputs, run.base]) for run in runs], axis=1)
+        size = np.sqrt(np.mean(np.abs(both) ** 2, axis=1) / runs[0].density)
+        for channel in np.flatnonzero(levels[number] > NO_NOISE * size):
+            best = most_unlikely(power[channel], bands)
+            if best is not None:
+                first, last, weight = best
+                factor = float(np.sqrt(np.mean(power[channel, first:last])))
+                found.append((weight, Excess(
+                    int(channel), number, float(freq[first]), float(freq[last - 1]), factor
+                )))  # fmt: skip
+    return tuple(one for _, one in sorted(found, key=lambda pair: -pair[0]))
+
+
+def noise_powers(fit: RecordFit) -> list[Array]:
+    """Squares of the noise of each channel as all errors tell it, over their variances, (c + d, lines) a run."""
+    parts: list[list[Array]] = [[] for _ in range(fit.test.n_runs)]
+    for chunk in fit.model.chunks(fit.parameters):
+        seen, V = chunk.weighed(fit.levels).whitened_residual, chunk.covered(fit.levels)
+        squares = chunk.deviations(fit.levels)[0][:, None] ** 2
+        of_outputs = squares - np.sum(np.abs(V) ** 2, axis=0)
+        H = chunk.H.swapaxes(0, 1)
+        base = np.sum(H.conj() * seen, axis=1)
+        hidden = sum(np.abs(np.sum(H.conj() * part, axis=1)) ** 2 for part in V)
+        of_base = np.sum(squares * np.abs(H) ** 2, axis=1) - hidden
+        both, size = np.abs(np.concatenate([seen, base])) ** 2, np.concatenate([of_outputs, of_base])
+        parts[chunk.run.number].append(both / np.where(size > 0, size, np.inf))
+    return [np.concatenate(part, axis=1) for part in parts]
+
+
+def _sizes(lines: int) -> Sequence[int]:
+    """Lines of bands: powers of two, and all lines."""
+    return [*(_FEWEST * 2**i for i in range(64) if _FEWEST * 2**i < lines), lines] if lines >= _FEWEST else []
+
+
+def _starts(size: int, lines: int) -> NDArray[np.intp]:
+    """First lines of bands of one size."""
+    return np.arange(0, lines - size + 1, max(size // 2, 1))
+
+
+def _count(lines: int) -> int:
+    """Number of bands."""
+    return sum(_starts(size, lines).size for size in _sizes(lines))
+
+
+def most_unlikely(power: Array, bands: int) -> tuple[int, int, float] | None:
+    """The band of lines with the least likely excess, of `bands` that are looked at; None where all may be chance.
+
+    Parameters
+    ----------
+    power : (lines,)
+        Squares, exponential variables of mean one where nothing but noise is there.
+
+    Returns
+    -------
+    first line, line after the last, logarithm of how unlikely it is about
+    """
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    best: tuple[int, int, float] | None = None
+    for size in _sizes(power.size):
+        first = _starts(size, power.size)
+        held = total[first + size] - total[first]
+        ratio = held / size
+        weight = size * (ratio - 1 - np.log(np.maximum(ratio, 1e-300)))  # Chernoff's bound
+        weight[ratio <= 1] = 0.0
+        at = int(np.argmax(weight))
+        if (best is None or weight[at] > best[2]) and scipy.special.gammaincc(size, held[at]) < FALSE_ALARM / bands:
+            best = int(first[at]), int(first[at] + size), float(weight[at])
+    return best
+
+
+def with_varying_levels(fit: RecordFit, *, monitor: FitMonitor | None = None) -> RecordFit:
+    """The fit with levels that vary, for the channels where the noise is not white; as it is where none is.
+
+    Also as it is where smooth levels do not explain what is left, which is the error of a model, at its peaks, or hum:
+    the levels are tried beside the modes as they are, and only then fitted with them.
+    """
+    assert fit.test.whole is not None
+    if fit.test.whole.noise is not None:
+        return fit
+    found, trial = excess_of(fit), fit
+    varying = np.zeros((fit.test.n_runs, fit.levels.shape[1]), bool)
+    while found:
+        before = varying.copy()
+        varying[[one.run for one in found], [one.channel for one in found]] = True
+        if np.array_equal(varying, before):
+            return fit
+        trial = _levels_alone(fit, varying.copy())
+        found = excess_of(trial)
+    if trial is fit:
+        return fit
+    trial = refitted(trial, fit.parameters, monitor=monitor)
+    return fit if excess_of(trial) or trial.schwarz < fit.schwarz else trial
+
+
+def _levels_alone(fit: RecordFit, varying: NDArray[np.bool_]) -> RecordFit:
+    """The fit with some levels that vary, and the modes as they are."""
+    assert fit.test.whole is not None
+    trial = replace(fit, test=replace(fit.test, whole=replace(fit.test.whole, varying=varying)))
+    levels = fit.levels_of_runs[[run.number for run in trial.model.runs]]
+    return replace(trial, levels=likeliest_levels(trial.model, fit.parameters, levels, fit.model.unknowns))
+
+
+def varying_levels(fit: RecordFit) -> tuple[VaryingLevel, ...]:
+    """Channels whose level varies, and between what deviations of a sample."""
+    varying = fit.model.whole.varying
+    if varying is None:
+        return ()
+    found = []
+    for number, channel in np.argwhere(varying):
+        rows = [run.piece for run in fit.model.runs if run.number == number]
+        std = np.sqrt(fit.levels[rows, channel])
+        found.append(VaryingLevel(int(channel), int(number), float(std.min()), float(std.max())))
+    return tuple(found)
+
+
+def unidentifiable_levels(fit: RecordFit) -> tuple[tuple[int, int], ...]:
+    """Run and channel of levels that were found and that the records do not determine; none where there is no noise."""
+    assert fit.test.whole is not None
+    outputs = fit.test.response if fit.test.force is None else np.concatenate([fit.test.response, fit.test.force], 1)
+    power = np.sum(np.abs(np.concatenate([outputs, fit.test.base], axis=1)) ** 2, axis=2)
+    rms = np.sqrt(power / (fit.test.own_lines.sum(axis=1) * fit.test.whole.density)[:, None])
+    if fit.test.whole.noise is not None or np.all(np.sqrt(fit.levels_of_runs) <= NO_NOISE * rms):
+        return ()
+    wide = level_deviations(fit.model, fit.parameters, fit.levels) > _UNTOLD
+    return tuple((int(run), int(channel)) for run, channel in np.argwhere(wide))
+
+
+def line_blocks(run: Run, fit: RecordFit, shift: float, widths: float = 3.0, least: int = 4) -> list[NDArray[np.intp]]:
+    """Lines of a run in blocks of so many half-power widths, of some lines at least; the first begins at a `shift`."""
+    modes = fit.parameters.modes
+    order = np.argsort(modes.omega)
+    width = np.interp(run.w, modes.omega[order], 2 * widths * (modes.ratios * modes.omega)[order])
+    spacing = np.gradient(run.w)
+    at = np.cumsum(spacing / np.maximum(width, least * spacing)) + shift
+    cuts = np.flatnonzero(np.diff(np.floor(at))) + 1
+    return np.split(np.arange(run.w.size), cuts)
+
+
+def scatter(fit: RecordFit) -> Array | None:
+    """Twice the covariance of the score over the unknowns of `Index`, (p, p); None where what is left is white.
+
+    With A, the information of the fit, the covariance of the modes is ``A^-1 B A^-1 / 2``; for white noise B is A.
+    """
+    # Levels stated too low or too high are no reason: the power of the misfit counts once, with the information.
+    return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
+
+
+def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
+    """The same, whatever is left, over partitions that begin later each: where blocks begin must not matter."""
+    model, p = fit.model, fit.parameters
+    N, size = unit_diagonal(fit.normal)
+    half = half_inverse(N, 1e-12)
+    meat = np.zeros((half.shape[1],) * 2)
+    columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
+    for shift in np.arange(partitions) / partitions:
+        for run, run_columns in zip(model.runs, columns, strict=True):
+            at = size[run_columns.unknowns]
+            for lines in line_blocks(run, fit, shift):
+                products = Chunk(model, p, run.at(lines)).products(fit.levels, run_columns)
+                score = half[run_columns.unknowns].T @ (products.gradient / at)
+                inner = half[run_columns.unknowns].T @ (products.normal / np.outer(at, at)) @ half[run_columns.unknowns]
+                taken, turn = np.linalg.eigh(inner)
+                grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
+                meat += np.outer(grown, grown) / partitions
+    # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
+    kept = model.kept
+    moved = (half @ meat @ half.T)[:kept, :kept] / np.outer(size[:kept], size[:kept])
+    A = fit.information()
+    B = np.zeros_like(A)
+    B[:kept, :kept] = 2 * A[:kept, :kept] @ moved @ A[:kept, :kept]
+    return B
+
+
+def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
+    """True where the power of what is left differs between blocks of lines, and from its mean, by more than chance.
+
+    In all blocks together, or rises above it in one.
+    """
+    model, c = fit.model, fit.model.channels
+    off, rare = [], []
+    powers: list[list[Array]] = [[] for _ in model.runs]
+    for chunk in model.chunks(fit.parameters):
+        powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
+    for run, parts in zip(model.runs, powers, strict=True):
+        power = np.concatenate(parts)
+        for lines in line_blocks(run, fit, 0.0):
+            held, numbers = np.sum(power[lines]) / mean, c * lines.size
+            off.append((held - numbers) / np.sqrt(numbers))
+            rare.append(scipy.special.gammaincc(numbers, held))
+    return bool(np.sum(np.square(off)) > beyond_chance(len(off), 2) or min(rare) < FALSE_ALARM / (2 * len(rare)))
+
+
+def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
+    """Runs stated to be at rest at both ends whose transients the records show, by a score test (Rao 1948).
+
+    Where the fit with these transients still leaves more than noise about the peaks, the model is wrong and no run is
+    accused. Where the fit was stopped none is looked for.
+    """
+    if fit.stopped:
+        return ()
+    assert fit.test.whole is not None
+    stated = [run for run, rest in enumerate(fit.test.whole.at_rest) if rest]
+    found = []
+    for run in stated:
+        moving, p = _moving(fit, (run,))
+        chi2, freedom = _score(moving, p)
+        if scipy.special.chdtrc(freedom, chi2) < FALSE_ALARM / len(stated):
+            found.append(run)
+    if not found:
+        return ()
+    again = refitted(*_moving(fit, tuple(found)))
+    return () if uneven(again) else tuple(found)
+
+
+def _moving(fit: RecordFit, runs: tuple[int, ...]) -> tuple[RecordFit, Parameters]:
+    """The fit with some runs in motion, not yet fitted, and its parameters, where their transients are zero."""
+    whole, p = fit.test.whole, fit.parameters
+    assert whole is not None
+    other = replace(whole, at_rest=tuple(rest and run not in runs for run, rest in enumerate(whole.at_rest)))
+    ends: Array = np.zeros((len(p.ends), 2 * len(other.moving)))
+    for at, run in enumerate(other.moving):
+        if run in whole.moving:
+            was = 2 * whole.moving.index(run)
+            ends[:, 2 * at : 2 * at + 2] = p.ends[:, was : was + 2]
+    return replace(fit, test=replace(fit.test, whole=other)), replace(p, ends=ends)
+
+
+def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
+    """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
+    model = RecordModel(fit.test, p.modes.omega.size)
+    equations = model.normal_equations(p, fit.levels)
+    N, size = unit_diagonal(equations.normal)
+    gradient = equations.gradient / size
+    added = np.zeros(model.size, bool)
+    ends = np.zeros(p.ends.shape, bool)
+    ends[:, np.all(p.ends == 0, axis=0)] = True
+    added[model.kept : model.kept + model.n_ends] = ends.ravel()
+    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
+    across = half.T @ N[np.ix_(~added, added)]
+    left = gradient[added] - across.T @ (half.T @ gradient[~added])
+    lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
+    seen = lam > ROUND_OFF
+    # The score has half the normal matrix for its covariance.
+    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
+
+
+def gain_errors_of(fit: RecordFit) -> Gains:
+    """A step of all unknowns from the end of a fit, the gains and what modes above the lines make among them.
+
+    Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
+    better known of both is taken. Motion with the base in any of its directions is asked for without it.
+    """
+    equations, G = fit.equations, fit.test.rigid_body
+    (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
+    beyond = max(fit.reduced, 1.0)
+    along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
+    normal, size = unit_diagonal(along.T @ equations.normal @ along)
+    gradient = along.T @ equations.gradient / size
+
+    def estimate(count: int) -> tuple[Array, Array]:
+        half = half_inverse(normal[:count, :count], ROUND_OFF)
+        step = half @ (half.T @ gradient[:count])
+        std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
+        return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
+
+    (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
+    plain_std = np.hypot(plain_std, plain - error)
+    better = plain_std < std
+    # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
+    # linear in it take the factor, and G u beside them pulls the fit.
+    half = half_inverse(normal[:at, :at], ROUND_OFF)
+    pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
+    moves = np.zeros((fit.model.index.size, n))
+    moves[: fit.model.kept] = pulled[: fit.model.kept]
+    by_sensor = moves[fit.model.index.phi].reshape(n, -1, n)
+    by_sensor[np.arange(n), :, np.arange(n)] += fit.parameters.modes.phi
+    rigid, chi2 = _rigid(fit, beyond)
+    return Gains(
+        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
+    )  # fmt: skip
+
+
+def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
+    """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
+    equations, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
+    count = at + n * d
+    normal, size = unit_diagonal(equations.normal[:count, :count])
+    half = half_inverse(normal, ROUND_OFF)
+    step = (half @ (half.T @ (equations.gradient[:count] / size)))[at:].reshape(n, d)
+    inverse_rows = half[at:].reshape(n, d, -1)
+    covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
+    chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)
+    return step / size[at:].reshape(n, d), chi2
