@@ -1,13 +1,16 @@
 """A sensor's gain that is wrong is told with its size, and counts among what is not known; right ones are not told."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 
 import sysid
 from sysid import FullMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.checks.gains import gain_errors, taken_at_sensors
+from sysid.assessment.checks.gains import distinct_poles, gain_errors, taken_at_sensors
+from sysid.assessment.checks.stated import force_misfit
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 
 ERROR = 0.02
@@ -54,6 +57,29 @@ class TestEstimate:
         found = gain_errors(ModalEstimate.of_lines(misread(test, sensor)), truth)
         np.testing.assert_allclose(found.error, expected, atol=1e-9)
         assert found.wrong.tolist() == [sensor]
+
+    @pytest.mark.parametrize("dampers", [(40.0, 60.0, 0.0), (0.0, 900.0, 0.0), (2000.0, 900.0, 700.0)])
+    def test_is_none_of_right_sensors_under_dampers_of_any_size(self, dampers):
+        """Of local dampers, up to ones that let modes creep back: poles are far from those of undamped modes."""
+        plain = storeys(matrix=True)
+        truth = Structure(plain.mass, plain.stiffness, n_base=1, damping_matrix=plain.damping + np.diag(dampers))
+        omega, ratios = distinct_poles(truth)
+        roots = np.concatenate([np.roots([1.0, 2 * z * w, w**2]) for w, z in zip(omega, ratios, strict=True)])
+        expected = scipy.linalg.eigvals(truth.to_state_space().A)
+        np.testing.assert_allclose(np.sort_complex(roots), np.sort_complex(expected), rtol=1e-6)
+        found = gain_errors(ModalEstimate.of_lines(simulate(truth, lines(truth))), truth)
+        np.testing.assert_allclose(found.error, 0.0, atol=1e-9)
+        assert not np.any(found.possible)
+
+    def test_leaves_a_force_of_wrong_gain_told_under_local_dampers(self):
+        plain = storeys(matrix=True)
+        damping = plain.damping + np.diag([2000.0, 900.0, 700.0])
+        truth = Structure(plain.mass, plain.stiffness, n_base=1, damping_matrix=damping)
+        right = simulate(truth, lines(truth), force=True)
+        formulation = SimpleNamespace(mass=SimpleNamespace(entries=None, free=True), geometry=SimpleNamespace(n=3))
+        assert not list(force_misfit(formulation, right, truth))
+        (told,) = force_misfit(formulation, dataclasses.replace(right, force=1.01 * right.force), truth)
+        assert told.numbers == pytest.approx({"misfit": 0.01 / 1.01, "free residues": 0.0}, abs=1e-6)
 
     def test_of_a_damping_matrix_too(self):
         truth = storeys(matrix=True)

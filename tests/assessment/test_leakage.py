@@ -58,6 +58,16 @@ def test_exact_response_functions_on_coarse_lines_have_no_leakage(noise):
     assert list(leakage(test, TRUTH)) == []
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_as_large_at_all_lines_is_no_flattened_peak_of_a_mode_that_hardly_moves_the_sensors(seed):
+    stretch = np.array([[1.0, 0, -1], [-1, 1, 0]])  # of a frame and of water sloshing in its tank, which no sensor sees
+    K = stretch.T @ np.diag([9e4, 900.0]) @ stretch
+    C = (stretch.T @ np.diag([100.0, 7.0]) @ stretch)[:2, :2]
+    truth = Structure(np.diag([80.0, 36.0, 0.0]), K, damping_matrix=C, n_base=1, recovery=np.eye(2)[:1])
+    test = simulate(truth, np.arange(0.4, 12.0, 0.012), noise=0.01, rng=seed)
+    assert list(leakage(test, truth)) == []
+
+
 def test_an_analysers_averages_are_told_where_the_fit_misses_their_peak():
     test = frf(h1(4000))
     assert not test.averaged

@@ -114,11 +114,20 @@ def _beyond(error: Array, std: Array) -> Array:
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:
-    """Distinct poles, rad/s and ratios."""
-    omega = 2 * np.pi * structure.natural_frequencies
-    poles = omega * (1 + 1j * structure.damping_ratios)
-    first = np.concatenate([[True], np.abs(np.diff(poles)) > NEGLIGIBLE * omega[1:]])
-    return omega[first], structure.damping_ratios[first]
+    """Distinct poles, rad/s and ratios; of a damping matrix those of the damped motion, which no undamped mode has."""
+    omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
+    if not structure.modal_damping:
+        zero, one = np.zeros((omega.size, omega.size)), np.eye(omega.size)
+        damping = structure.normal_modes.T @ structure.damping @ structure.normal_modes
+        s = np.linalg.eigvals(np.block([[zero, one], [-np.diag(omega**2), -damping]]))
+        # Real ones in twos, any two of which make the same functions of frequency.
+        pairs = np.array([*zip(s[s.imag > 0], s[s.imag < 0], strict=True), *np.sort(s[s.imag == 0]).reshape(-1, 2)])
+        pairs = pairs[np.argsort(np.prod(pairs, axis=1).real)]
+        omega = np.sqrt(np.prod(pairs, axis=1).real)
+        ratios = -pairs.sum(axis=1).real / (2 * omega)
+    poles = omega * (1 + 1j * ratios)
+    first = ~np.triu(np.abs(poles[:, None] - poles) <= NEGLIGIBLE * omega, 1).any(axis=0)
+    return omega[first], ratios[first]
 
 
 def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
