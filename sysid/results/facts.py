@@ -16,7 +16,6 @@ from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.formulation import Formulation
-from sysid.problem.given import MATRICES
 from sysid.problem.matrices import MATRICES
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest

@@ -324,17 +324,19 @@ def _mac(structure: Structure, i: int, j: int) -> float:
 def _missed(test: Measurement, structure: Structure, frequency: float, width: float) -> str | None:
     """Misfit of a fit about a peak, in words; None where that is no more than elsewhere.
 
-    Noise as large at all lines is less of the response at a peak, noise in proportion to it the same: only a peak
-    itself that is not what modes make of it stands out.
+    Noise as large at all lines is more of a weak mode's response than of others, but no larger there; noise in
+    proportion to the response is larger at a peak, but no more of it. Only a peak itself that is not what modes make of
+    it stands out both ways.
     """
     distance = np.gradient(test.freq)
     near = np.abs(test.freq - frequency) < _NEAR * np.maximum(width, distance)
     if not np.any(near) or np.all(near):
         return None
     left = test.relative - test.predict(structure)
-    share = lambda at: float(np.linalg.norm(left[..., at]) / np.linalg.norm(test.relative[..., at]))  # noqa: E731
-    there, elsewhere = share(near), share(~near)
-    if there < _MISSED * elsewhere or there < NEGLIGIBLE:
+    size = lambda record, at: float(np.sqrt(np.mean(np.abs(record[..., at]) ** 2)))  # noqa: E731
+    missed, missed_elsewhere = size(left, near), size(left, ~near)
+    there, elsewhere = missed / size(test.relative, near), missed_elsewhere / size(test.relative, ~near)
+    if there < max(_MISSED * elsewhere, NEGLIGIBLE) or missed < _MISSED * missed_elsewhere:
         return None
     return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"
 
