@@ -10,7 +10,7 @@ from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.cli.stored_result import add_result_arguments, read_result
 from sysid.export.content import reliability
-from sysid.export.export import export, format_of
+from sysid.export.export import export, format_of, precision
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
@@ -20,8 +20,8 @@ def run(options: argparse.Namespace, out: Output) -> int:
     result = read_result(options, out)
     out.wrote(export(result, target))
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
-    out.write(f"{form.name}; precision: {form.precision}{without}\n")
-    out.answer(format=form.name, precision=form.precision, deviations=form.deviations, judgement=result.judgement)
+    out.write(f"{form.name}; precision: {precision(target)}{without}\n")
+    out.answer(format=form.name, precision=precision(target), deviations=form.deviations, judgement=result.judgement)
     if result.interrupted or not result.determined:
         out.warn(f"{target.name}: {reliability(result)}. Read {form.note}, or report.html")
     return SUCCESS
