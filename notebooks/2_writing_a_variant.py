@@ -54,7 +54,7 @@ def structure(mass, spring, damper):
 
 
 truth = structure(**true)
-freq = np.linspace(1.0, 20.0, 250)  # Hz
+freq = np.linspace(1.0, 20.0, 120)  # Hz
 test = sysid.simulate(truth, freq, noise=0.01, rng=1)
 print("natural frequencies, Hz:", truth.natural_frequencies.round(2), " damping ratios:", truth.damping_ratios.round(4))
 

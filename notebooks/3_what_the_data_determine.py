@@ -76,7 +76,7 @@ def member(t):
 
 t = np.array([0.4, 2.4])
 other = member(t)
-freq = np.linspace(1, 10, 600)
+freq = np.linspace(1, 10, 300)
 answers = [structure.transmissibility(freq) for structure in (frame, other)]
 difference = np.abs(answers[1] - answers[0]).max() / np.abs(answers[0]).max()
 in_mass, in_stiffness = (
@@ -259,7 +259,7 @@ def posts(offset):
     return sysid.Structure(np.diag([10 * (1 + offset), 10 * (1 - offset), 0]), stiffness, [0.01, 0.01], n_base=1)
 
 
-lines = np.linspace(10, 25, 600)
+lines = np.linspace(10, 25, 250)
 figure, panels = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, layout="constrained")
 for ax, offset in zip(panels, (0.0, 0.01), strict=True):
     test = sysid.simulate(posts(offset), lines, noise=0.01, force=True, rng=0)
@@ -291,7 +291,7 @@ for offset in (0.0, 0.01):
 # over the tests).
 
 # %%
-offsets = [0.01, 0.02, 0.03, 0.05, 0.1, 0.2]
+offsets = [0.01, 0.02, 0.05, 0.2]
 share, errors, spread, verdicts = [], [], [], []
 for offset in offsets:
     truth = posts(offset)

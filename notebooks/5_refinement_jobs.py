@@ -40,7 +40,7 @@ print(result.residual, result.success)
 # %%
 recipe = replace(recipe, start=result.x)
 folder = Path(tempfile.mkdtemp())
-ends = list(sysid.jobs.submit(recipe, starts=8, out=folder))
+ends = list(sysid.jobs.submit(recipe, starts=5, out=folder))
 for end in ends:
     print(end.index, end.success, f"{end.residual:.2e}", end.message[:60])
 
@@ -64,6 +64,6 @@ sysid.plot.minima(minima, "magnitude_only", goal=problem.goal)
 # Those that stand in the folder of the jobs are not computed again.
 
 # %%
-again = list(sysid.jobs.submit(recipe, starts=10, executor=sysid.jobs.processes(2), out=folder))
-assert all(np.array_equal(one.x, other.x) for one, other in zip(ends, again[:8], strict=True))
-print([end.index for end in again[8:]])
+again = list(sysid.jobs.submit(recipe, starts=6, executor=sysid.jobs.processes(2), out=folder))
+assert all(np.array_equal(one.x, other.x) for one, other in zip(ends, again[:5], strict=True))
+print([end.index for end in again[5:]])

@@ -49,6 +49,12 @@ def no_pictures(monkeypatch):
     )
 
 
+@pytest.fixture
+def no_other_answers(monkeypatch):
+    """Look for no other structures that explain the records as well, which takes as long as all else."""
+    monkeypatch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
+
+
 def _geometry(rng, n, d):
     """Rows [e', (r x e)'] of n sensors at random places along random axes, the first d columns."""
     r, e = rng.uniform(-1, 2, (n, 3)), rng.normal(size=(n, 3))

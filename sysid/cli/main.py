@@ -190,8 +190,9 @@ def _export(options: argparse.Namespace, out: Output) -> int:
     result = requests.read_result(options, out)
     out.wrote(formats.export(result, target))
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
-    out.write(f"{form.name}; precision: {form.precision}{without}\n")
-    out.answer(format=form.name, precision=form.precision, deviations=form.deviations, judgement=result.judgement)
+    precision = formats.precision(target)
+    out.write(f"{form.name}; precision: {precision}{without}\n")
+    out.answer(format=form.name, precision=precision, deviations=form.deviations, judgement=result.judgement)
     if result.interrupted or not result.determined:
         out.warn(f"{target.name}: {content.reliability(result)}. Read {form.note}, or report.html")
     return SUCCESS

@@ -95,3 +95,8 @@ def format_of(path: Path) -> Format:
         known = ", ".join(f"{ending} ({form.name})" for ending, form in FORMATS.items())
         raise InputError(f"{path}: no format has the ending {path.suffix!r}; there are {known}")
     return found
+
+
+def precision(path: str | Path) -> str:
+    """Precision of the numbers in a file of this ending, in words."""
+    return format_of(Path(path)).precision

@@ -216,9 +216,8 @@ def run_of(
 def _base_motion(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """Motion of the base point from its sensors by least squares, (d, n)."""
     seen, values = _motions(parts, said, axes), np.array([values for _, values in parts])
-    shown = np.linalg.matrix_rank(seen) == len(axes)
-    words = "the base's sensors do not show its motion along"
-    refuse((not shown, f"{place}: {words} {' '.join(axes)}: each direction needs one"))
+    words = f"the base's sensors do not show its motion along {' '.join(axes)}: each direction needs one"
+    refuse((np.linalg.matrix_rank(seen) < len(axes), f"{place}: {words}"))
     return values if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ values
 
 

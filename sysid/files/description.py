@@ -115,8 +115,8 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         _channel(entry, f"{place}, sensor {at}")
         for at, entry in enumerate(listed and sequence(f"{place}: sensor", listed, "a list of sensors"), 1)
     )
-    own = [channel for channel in channels if not channel.reference]
-    columns, names = [one.column for one in own], [one.name for one in own if one.role == "response"]
+    plain = [channel for channel in channels if not channel.reference]
+    columns, names = [one.column for one in plain], [one.name for one in plain if one.role == "response"]
     twice = next((one for one in columns if columns.count(one) > 1), None)
     alike = next((one for one in names if names.count(one) > 1), None)
     refuse(

@@ -161,8 +161,8 @@ def load(path: str | Path) -> RecordedTest:
     """
     file = Path(path)
     tree = _tree(file)
-    if tree.get("content") != _CONTENT:
-        raise InputError(f"{file} holds a {tree.get('content', 'result')}, not a test: give what 'sysid read' wrote")
+    content = tree.get("content", "result")
+    refuse((content != _CONTENT, f"{file} holds a {content}, not a test: give what 'sysid read' wrote"))
     try:
         return RecordedTest.from_tree(tree)
     except InputError as error:
@@ -177,12 +177,9 @@ def _tree(file: Path) -> dict[str, Any]:
         image = file.read_bytes()
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror or error}") from None
-    if not is_tree(image):
-        raise InputError(
-            f"{file} is not a test that sysid wrote: 'sysid read {file} --sensors SENSORS.toml --out test.h5' makes one"
-        )
+    makes = f"'sysid read {file} --sensors SENSORS.toml --out test.h5' makes one"
+    refuse((not is_tree(image), f"{file} is not a test that sysid wrote: {makes}"))
     try:
-        tree, _ = from_bytes(image)
+        return from_bytes(image)[0]
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    return tree

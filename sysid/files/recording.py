@@ -110,19 +110,14 @@ def check_column(column: Column, path: Path) -> None:
     """Refuse a column with a number that is NaN or infinite, with its place."""
     bad = np.flatnonzero(~np.isfinite(column.values))
     if bad.size:
-        raise InputError(
-            f"{path}, {column.place}: sample {bad[0] + 1} of {column.values.size} is {column.values[bad[0]]} "
-            f"({bad.size} such): cut the record there, or leave this sensor out"
-        )
+        words = f"sample {bad[0] + 1} of {column.values.size} is {column.values[bad[0]]} ({bad.size} such)"
+        raise InputError(f"{path}, {column.place}: {words}: cut the record there, or leave this sensor out")
 
 
 def rate_of(time: Array, path: Path, place: str) -> float:
     """Sample rate of a time column in s, Hz; numbers rounded to a quarter of a step are even.
 
-    Raises
-    ------
-    InputError
-        Where time does not rise, or its steps are uneven: says at which sample.
+    Refused is time that does not rise, or whose steps are uneven, with its sample.
     """
     refuse((time.size < 3, f"{path}: {time.size} samples are no record: is it the right file, and whole?"))
     falls = np.flatnonzero(np.diff(time) <= 0)
@@ -133,9 +128,8 @@ def rate_of(time: Array, path: Path, place: str) -> float:
             cause = "a sample twice, or times that are rounded? State sample_rate in place of time (--rate)"
         elif falls.size > time.size / 2:
             cause = "it runs backwards: is it the right column?"
-        raise InputError(
-            f"{path}, {place}: time does not rise at sample {falls[0] + 2} ({before:g}, then {after:g} s): {cause}"
-        )
+        words = f"time does not rise at sample {falls[0] + 2} ({before:g}, then {after:g} s)"
+        raise InputError(f"{path}, {place}: {words}: {cause}")
     step = (time[-1] - time[0]) / (time.size - 1)
     late = np.abs(time - time[0] - step * np.arange(time.size))
     at = int(np.argmax(np.abs(np.diff(time) - np.median(np.diff(time)))))
@@ -206,10 +200,8 @@ def _rising(freq: Array, place: str) -> Array:
     falls = np.flatnonzero(~(np.diff(freq) > 0))
     if falls.size:
         at = int(falls[0])
-        raise InputError(
-            f"{place}: frequencies do not rise at line {at + 2} ({freq[at]:g}, then {freq[at + 1]:g} Hz): two tests in "
-            "one file? Write each to a file of its own"
-        )
+        words = f"frequencies do not rise at line {at + 2} ({freq[at]:g}, then {freq[at + 1]:g} Hz)"
+        raise InputError(f"{place}: {words}: two tests in one file? Write each to a file of its own")
     return freq
 
 
@@ -244,14 +236,9 @@ def _complex(first: Column, second: Column, path: str) -> Any:
         refuse((unlike, f"{place}: real part in {first.unit!r}, imaginary part in {second.unit!r}: mend the header"))
         return first.values + 1j * second.values
     angle = units.find(second.unit) or units.Unit("", 1.0)
+    decibels, unsaid = first.unit.lower().startswith("db"), angle.quantity != "angle"
     refuse(
-        (
-            first.unit.lower().startswith("db"),
-            f"{path}, {first.place}: magnitudes in dB have no unit here: export them linear",
-        ),
-        (
-            angle.quantity != "angle",
-            f"{place}: is the phase in degrees or in radians? State it in the header, such as [deg]",
-        ),
+        (decibels, f"{path}, {first.place}: magnitudes in dB have no unit here: export them linear"),
+        (unsaid, f"{place}: is the phase in degrees or in radians? State it in the header, such as [deg]"),
     )
     return first.values * np.exp(1j * angle.factor * second.values)

@@ -70,13 +70,7 @@ def is_tree(image: bytes) -> bool:
 
 
 def from_bytes(image: bytes) -> tuple[Tree, int]:
-    """The tree and the number of its format; nothing is read before length and SHA-256 are found to be right.
-
-    Raises
-    ------
-    InputError
-        Where the bytes are not those that were written.
-    """
+    """The tree and the number of its format; refused before anything is read where the bytes are not those written."""
     import h5py
 
     header = _HEADER.fullmatch(image[:_BLOCK])

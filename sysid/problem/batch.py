@@ -36,7 +36,8 @@ class Batch:
 
     def __init__(self, function: ca.Function, threads: int = 0) -> None:
         self._in_step = _is_scalar(function)
-        self._chunk = _IN_STEP if self._in_step else CHUNK
+        # One after the other a chunk that few candidates fill costs as much as a full one.
+        self._chunk = _IN_STEP if self._in_step else CHUNK if threads else 8
         if self._in_step:
             function = _without_zeros(function)
             self._compiled = elementwise(function, self._chunk)

@@ -65,7 +65,7 @@ def uninterrupted():
 
 @pytest.mark.parametrize(
     ("form", "strategy", "shares"),
-    [("chain", "continuation", ENDS), ("chain", SHORT, ENDS), ("free", SHORT, ENDS),
+    [("chain", "continuation", [0.5, 1.0]), ("chain", SHORT, [0.5, 1.0]), ("free", SHORT, ENDS),
      ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders"), ENDS),
      ("chain", "auto", [0.5]), ("free", "auto", ENDS)],  # of the chain "auto" is continuation too
 )  # fmt: skip

@@ -37,14 +37,8 @@ def judged(problem, **values):
         return judge(problem, problem.prepared, end, "from the truth", 0, Session([], interrupt))
 
 
-@pytest.fixture
-def nothing_else(monkeypatch):
-    """No other answers are looked for, which takes seconds."""
-    monkeypatch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
-
-
 @pytest.mark.parametrize(("std", "known"), [(0.5, False), (0.02, True)])
-def test_records_without_noise_know_no_more_than_the_mass_that_gives_their_scale(std, known, nothing_else):
+def test_records_without_noise_know_no_more_than_the_mass_that_gives_their_scale(std, known, no_other_answers):
     """Accelerations alone: M, K and C are in proportion to a mass of 2 kg that is stated to 25 %, or to 1 %."""
     m = sysid.Variable("m", 2, lower=0.5, upper=9.0, guess=2.1)
     k = sysid.Variable("k", lower=100.0, upper=5e3, guess=820.0)
@@ -60,7 +54,7 @@ def test_records_without_noise_know_no_more_than_the_mass_that_gives_their_scale
 
 
 @pytest.mark.parametrize(("noise", "known"), [(2.0, False), (0.02, True)])
-def test_records_without_noise_know_no_more_than_the_noisy_force_of_a_further_test(noise, known, nothing_else):
+def test_records_without_noise_know_no_more_than_the_noisy_force_of_a_further_test(noise, known, no_other_answers):
     """Accelerations of both are exact; the scale of M, K and C is the force's, at 40 lines."""
     scale = sysid.Variable("scale", lower=0.1, upper=9.0, guess=1.1)
     C = damped()
