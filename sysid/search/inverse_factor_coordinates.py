@@ -28,8 +28,8 @@ from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import IterationMonitor, NonlinearProgram, product, time_too_short
 from sysid.problem.prepared import Prepared
-from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
-from sysid.search.modal_program import stated_totals
+from sysid.search.modal_coordinates import modes_of, spectrum_near, unknowns_of
+from sysid.search.modal_program import End, stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries

@@ -31,11 +31,12 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.local import LocalResult, fit_apart, solve
-from sysid.search.modal_coordinates import End
+from sysid.search.local import LocalResult, solve
 from sysid.search.modal_program import (
+    End,
     Spectrum,
     Ties,
+    fit_apart,
     nearest_lumped,
     of_known_mass,
     solve_modes,

@@ -13,7 +13,8 @@ nearest to a lumped mass is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -32,6 +33,8 @@ from sysid.modal_analysis.modal_estimate import (
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
+from sysid.models.spectrum import SOLVED
+from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.nlp import IterationMonitor, NonlinearProgram, NumpyFunction, product
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
@@ -40,6 +43,16 @@ from sysid.structure.triangular import lower_entries, lower_triangle, triangle_e
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
+
+
+class End(NamedTuple):
+    """Where IPOPT ended: unknowns (n_variables,), objective, status, and bounds in words."""
+
+    x: Array
+    objective: float
+    status: str
+    bounds: str
+    remark: str = ""
 
 
 def solve_modes(
@@ -391,3 +404,42 @@ def of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
     rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
     t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
     return np.maximum(t, np.finfo(float).eps * t.max())
+
+
+def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:
+    """The same end with the unknowns that enter no matrix fitted to the terms and constraints that they enter.
+
+    Where modes are free nothing connects them with the others.
+    """
+    formulation = problem.formulation
+    at = formulation.parts.damping.stop
+    if at == formulation.size or monitor.stopped is not None:
+        return end
+    z, auxiliary = NonlinearProgram(), formulation.unknowns[sum(map(len, formulation.of_models)) :]
+    start = np.clip(end.x[at:], formulation.lower[at:], formulation.upper[at:])
+    unknowns = ca.vertcat(ca.DM(end.x[:at]), add_unknowns(z, auxiliary, start))
+    constraints = formulation.constraints
+    if constraints.lower.size:
+        z.constrain(constraints.function(unknowns), constraints.lower, constraints.upper)
+    rows = ca.vertcat(ca.MX(0, 1), *(term.rows(unknowns) for term in formulation.beside))
+    best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations)
+    x = np.asarray(ca.Function("end", [z.z], [unknowns])(best)).ravel()
+    if status in SOLVED:
+        return end._replace(x=x)
+    return end._replace(x=x, status=status, remark=f"{end.remark or end.status}; that is of what enters no matrix")
+
+
+def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, held: slice = slice(0, 0)) -> ca.MX:
+    """The unknowns as expressions of new ones in units of their scale, those in `held` as numbers."""
+    pieces, at = [], 0
+    for unknown, values in zip(unknowns, split(unknowns, x), strict=True):
+        if held.start <= at < held.stop:
+            pieces.append(ca.MX(ca.DM(values)))
+        else:
+            unit = scales_of([unknown], values)  # its start, or a part of its range where that is larger
+            unit = np.where(unit > 0, unit, 1.0)
+            labels = [label.removeprefix(unknown.title) for label in unknown.labels]
+            scaled = z.variable(unknown.title, values / unit, unknown.lower / unit, unknown.upper / unit, labels)
+            pieces.append(scaled * ca.DM(unit))
+        at += unknown.size
+    return ca.vertcat(*pieces)
