@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.models.registry import BESIDE, PROBLEM_MODULE
 from sysid.models.unknowns import NO_COMPLEX, NO_TRUTH, declared
 from sysid.problem.problem import Problem
@@ -208,13 +208,15 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
     try:
-        if path.exists() and not path.is_file():  # a device, or a pipe, may never end
-            raise InputError(f"problem {path} is not a file")
-        if path.exists() and path.suffix != ".py":  # a test or a result that somebody else made may hold Python
-            raise InputError(
-                f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
-                "'sysid run TEST.h5'"
-            )
+        other = (
+            f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
+            "'sysid run TEST.h5'"
+        )
+        refuse(
+            # A device, or a pipe, may never end; a test or a result that somebody else made may hold Python.
+            (path.exists() and not path.is_file(), f"problem {path} is not a file"),
+            (path.exists() and path.suffix != ".py", other),
+        )
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None

@@ -41,26 +41,14 @@ Coordinates = Literal["modal", "cholesky", "entries"]
 class LocalResult:
     """Result of the local phase.
 
-    Attributes
-    ----------
-    x : (n_variables,)
-        The problem's unknowns; where modes are free, only the damping is held by the box, and frequencies have windows
-        about those stated.
-    success : bool
-        IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off.
-    message : str
-        IPOPT's status and what else the user must know, such as a bound that the solution ends on.
-    curve : (iterations,)
-        Objective of each iterate, over all attempts.
-    stopped : BaseException or None
-        What the listener raised, or Ctrl-C; `x` is then the last iterate.
+    Where modes are free, only the damping in `x` is held by the box, and frequencies have windows about those stated.
     """
 
-    x: Array
-    success: bool
-    message: str
-    curve: Array
-    stopped: BaseException | None = None
+    x: Array  # the problem's unknowns, (n_variables,)
+    success: bool  # Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off
+    message: str  # IPOPT's status and what else the user must know, such as a bound that the solution ends on
+    curve: Array  # objective of each iterate, over all attempts
+    stopped: BaseException | None = None  # what the listener raised, or Ctrl-C; `x` is then the last iterate
 
 
 def solve(

@@ -306,19 +306,10 @@ def to_stated_totals(
     """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
 
     Scaling all modal masses by one t changes no response; the remainder is invisible in accelerations. It keeps its
-    correlations, and takes what mass the modes leave.
-
-    Parameters
-    ----------
-    P : (m, m)
-        Inverse of the mode shapes at the degrees of freedom.
-    gamma, G : (m, d)
-        Participations, and rigid motion of the degrees of freedom.
-    groups : (m,)
-        Base direction of each degree of freedom, -1 for none.
-    scaled : bool
-        Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
-        less than they make, is then what they make.
+    correlations, and takes what mass the modes leave. P (m, m) is the inverse of the mode shapes at the degrees of
+    freedom, gamma and G (m, d) are participations and rigid motion, `groups` (m,) base directions, -1 for none. Where
+    known masses have `scaled` the modal masses already t is one; a total that is not stated, or less than they make, is
+    then what they make.
     """
     spare = 0.0 if problem.measurement.force is not None else _LEAST_SHARE  # a force tells what the base has
     if problem.rigid_total is not None:

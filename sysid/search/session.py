@@ -31,14 +31,9 @@ _SHARE = 0.05  # of the time that writing may take
 class Journal:
     """The long parts of a search in their order.
 
-    Parameters
-    ----------
-    write : callable, optional
-        Keeps the entries that it is given; without it nothing is kept.
-    entries : dict, optional
-        Those of an earlier run of the same search: name and content of each part, by its number as a text.
-    every : float
-        s between two writings, at least; more where writing takes long.
+    `write` keeps the entries that it is given, at least `every` so many s, more where writing takes long; without it
+    nothing is kept. `entries` are those of an earlier run of the same search: name and content of each part, by its
+    number as a text.
     """
 
     def __init__(
