@@ -23,16 +23,7 @@ from sysid.results.identification import Identification
 from sysid.results.judgement import judge
 from sysid.results.stated_masses import with_stated_masses
 from sysid.search.auto import InTurn, check_local_phase, check_strategy, choose, robust_fit
-from sysid.search.session import (
-    DeferredInterrupt,
-    Journal,
-    Progress,
-    Session,
-    limits_of,
-    listeners_of,
-    regularly,
-    seed_of,
-)
+from sysid.search.session import DeferredInterrupt, Journal, Progress, Session, limits_of, listeners_of, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
 
@@ -126,7 +117,7 @@ def identify(
 def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     try:
-        with regularly((monitor := session.fit_monitor()).check):
+        with session.fit_monitor() as monitor:
             problem.modal = fit_tests(problem.stated.tests, monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()

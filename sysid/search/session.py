@@ -334,9 +334,12 @@ class Session:
             self.interrupt.count = max(self.interrupt.count, 1)
         self._check_limits()
 
-    def fit_monitor(self, share: float = 0.8) -> FitMonitor:
-        """Monitor of the fit of modes, which has a share of the time: the rest is for what follows."""
-        return FitMonitor(self.preparing, self._check_fit, None if self.left is None else share * self.left)
+    @contextlib.contextmanager
+    def fit_monitor(self, share: float = 0.8) -> Iterator[FitMonitor]:
+        """Monitor of the fit of modes, asked at any time; the fit has a share of the time, what follows the rest."""
+        monitor = FitMonitor(self.preparing, self._check_fit, None if self.left is None else share * self.left)
+        with regularly(monitor.check):
+            yield monitor
 
     def _check_fit(self, kept: bool) -> None:
         """End a fit, at any time: at Ctrl-C, at the time limit, and, where one is `kept`, as a callback wants it."""
