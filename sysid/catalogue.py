@@ -77,18 +77,11 @@ def short_name(problem: str) -> str:
 def build(recipe: Recipe) -> Problem:
     """Load a problem module and call its ``problem()``.
 
-    Parameters
-    ----------
-    recipe : Recipe
-        ``module`` is a path to a module, which ends in .py, else a bundled problem, else a module in ``./problems``,
-        else a dotted module that Python can import.
-        ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
-
-    Raises
-    ------
-    InputError
-        Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
-        InputError from inside the module passes as it is, any other exception is told with its line of the module.
+    The recipe's ``module`` is a path to a module, which ends in .py, else a bundled problem, else a module in
+    ``./problems``, else a dotted module that Python can import. ``data`` reaches ``problem()`` as a `pathlib.Path`, or
+    as None, ``parameters`` each by its name. An InputError tells whatever is wrong with the module, its data or what it
+    gives, a problem that cannot be searched too; one from inside the module passes as it is, any other exception is
+    told with its line of the module.
     """
     return built(recipe)[0]
 

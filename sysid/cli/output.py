@@ -82,13 +82,9 @@ class Stream:
 class Output:
     """Output of one command; control characters, as a name in a file may hold some, are spelled out.
 
-    Parameters
-    ----------
-    json : bool
-        In the place of words one JSON document, at the end: ``status``, ``files`` that were written, ``warnings``, the
-        command's own figures, and ``error`` where there is one.
-    quiet : bool
-        No words and no progress; complaints, warnings and the document remain.
+    With `json` one document takes the place of words, at the end: ``status``, ``files`` that were written,
+    ``warnings``, the command's own figures, and ``error`` where there is one. `quiet` leaves complaints, warnings and
+    the document alone.
     """
 
     def __init__(self, *, json: bool = False, quiet: bool = False) -> None:

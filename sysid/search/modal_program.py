@@ -129,15 +129,8 @@ def solve_modes(
 class ModalResidual:
     """Weighted residual as CasADi expressions, its shapes eliminated.
 
-    Attributes
-    ----------
-    phi : (n, m)
-        The best shapes.
-    left : (n, 2 L)
-        Weighted errors of the accelerations, real parts beside imaginary ones.
-    force_left : (d, 2 L), or None
-    value :
-        Their sum of squares.
+    `phi` (n, m) are the best shapes, `left` (n, 2 L) the weighted errors of the accelerations, real parts beside
+    imaginary ones, `force_left` (d, 2 L), or None, those of the force, and `value` is their sum of squares.
     """
 
     def __init__(
@@ -207,13 +200,7 @@ class EstimateResidual:
     """Misfit of modes to an estimate, in units of its noise and of the records, the best shapes eliminated.
 
     Half a chi-squared rises by ``|R (theta - estimate)|²``, with ``R' R`` the information; shapes enter it linearly.
-
-    Attributes
-    ----------
-    phi : (n, m)
-        The best shapes.
-    value :
-        The sum of squares.
+    `phi` (n, m) are the best shapes, `value` is the sum of squares.
     """
 
     def __init__(self, modal: ModalEstimate, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX) -> None:
