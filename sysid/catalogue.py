@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.models.unknowns import NO_COMPLEX, NO_TRUTH, declared
 from sysid.problem.problem import Problem
 from sysid.problem.stored import BESIDE, PROBLEM_MODULE
@@ -77,18 +77,11 @@ def short_name(problem: str) -> str:
 def build(recipe: Recipe) -> Problem:
     """Load a problem module and call its ``problem()``.
 
-    Parameters
-    ----------
-    recipe : Recipe
-        ``module`` is a path to a module, which ends in .py, else a bundled problem, else a module in ``./problems``,
-        else a dotted module that Python can import.
-        ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
-
-    Raises
-    ------
-    InputError
-        Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
-        InputError from inside the module passes as it is, any other exception is told with its line of the module.
+    The recipe's ``module`` is a path to a module, which ends in .py, else a bundled problem, else a module in
+    ``./problems``, else a dotted module that Python can import. ``data`` reaches ``problem()`` as a `pathlib.Path`, or
+    as None, ``parameters`` each by its name. An InputError tells whatever is wrong with the module, its data or what it
+    gives, a problem that cannot be searched too; one from inside the module passes as it is, any other exception is
+    told with its line of the module.
     """
     return built(recipe)[0]
 
@@ -208,13 +201,15 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
     try:
-        if path.exists() and not path.is_file():  # a device, or a pipe, may never end
-            raise InputError(f"problem {path} is not a file")
-        if path.exists() and path.suffix != ".py":  # a test or a result that somebody else made may hold Python
-            raise InputError(
-                f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
-                "'sysid run TEST.h5'"
-            )
+        other = (
+            f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
+            "'sysid run TEST.h5'"
+        )
+        refuse(
+            # A device, or a pipe, may never end; a test or a result that somebody else made may hold Python.
+            (path.exists() and not path.is_file(), f"problem {path} is not a file"),
+            (path.exists() and path.suffix != ".py", other),
+        )
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None

@@ -117,7 +117,7 @@ def identify(
 def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     try:
-        with session.fitting() as monitor:
+        with session.fit_monitor() as monitor:
             problem.modal = fit_tests(problem.stated.tests, monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()

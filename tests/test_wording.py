@@ -32,8 +32,7 @@ from sysid import (
 )
 from sysid.cli import doctor, refine, requests
 from sysid.cli import main as cli
-from sysid.cli.files import alone_in, results_folder
-from sysid.cli.output import Output
+from sysid.cli.output import Output, alone_in, results_folder
 from sysid.compare.comparison import Comparison, comparison_text
 from sysid.files import reading
 from sysid.files.assembly import work_of_force

@@ -130,21 +130,7 @@ def _add_run(command: Adder) -> None:
         ),
     )
     _add_problem(run, optional=True)
-    run.add_argument(
-        "--mass",
-        type=_masses,
-        metavar="KG",
-        help="of TEST.h5: mass of the structure, kg, a number or one a direction: 1450 or 1450,1450,1450; with "
-        "--lumped that at the sensors alone, without what moves with the table (adapter, base ring)",
-    )
-    run.add_argument("--lumped", action="store_true", default=None, help="of TEST.h5: masses at the sensors alone")
-    run.add_argument(
-        "--band", type=_band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
-    )
-    run.add_argument(
-        "--goal", type=float, metavar="SHARE",
-        help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
-    )  # fmt: skip
+    _add_test_options(run)
     run.add_argument(
         "--seed",
         type=_seed,
@@ -185,6 +171,25 @@ def _add_run(command: Adder) -> None:
     )
     _add_trust(run, "the unfinished run")
     run.add_argument("--fresh", action="store_true", help="begin anew where there is an unfinished run in the folder")
+
+
+def _add_test_options(run: argparse.ArgumentParser) -> None:
+    """Add what may be said of a test file: masses, lines that are fitted, and what is near enough."""
+    run.add_argument(
+        "--mass",
+        type=_masses,
+        metavar="KG",
+        help="of TEST.h5: mass of the structure, kg, a number or one a direction: 1450 or 1450,1450,1450; with "
+        "--lumped that at the sensors alone, without what moves with the table (adapter, base ring)",
+    )
+    run.add_argument("--lumped", action="store_true", default=None, help="of TEST.h5: masses at the sensors alone")
+    run.add_argument(
+        "--band", type=_band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
+    )
+    run.add_argument(
+        "--goal", type=float, metavar="SHARE",
+        help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
+    )  # fmt: skip
 
 
 def _add_compare(command: Adder) -> None:
@@ -267,6 +272,14 @@ def _add_refine(command: Adder) -> None:
         help="the problem module of RESULT, in the place of the one that RESULT names; a bundled one need not be named",
     )
     _add_trust(refine, "RESULT")
+    _add_kinds(refine)
+    refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
+    refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
+    refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
+
+
+def _add_kinds(refine: argparse.ArgumentParser) -> None:
+    """Add the kinds of jobs, of which one is asked for."""
     kinds = refine.add_mutually_exclusive_group()
     kinds.add_argument(
         "--starts",
@@ -307,9 +320,6 @@ def _add_refine(command: Adder) -> None:
         metavar="MODULE",
         help="identify by other problem modules from the same data: AIC, BIC and the residual of the validation tests",
     )
-    refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
-    refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
-    refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
 
 
 def _add_report(command: Adder) -> None:

@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.cli.files import png, results_folder, write_files
-from sysid.cli.output import Output, strict_json
+from sysid.cli.output import Output, png, results_folder, strict_json, write_files
 from sysid.cli.requests import recipe_of
 from sysid.cli.starting import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.compare import peers

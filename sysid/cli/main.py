@@ -24,15 +24,25 @@ from typing import IO, NoReturn, cast
 from sysid import catalogue
 from sysid.cli import requests, starting
 from sysid.cli.arguments import JSON, QUIET, command_parser
-from sysid.cli.files import alone_in, replaced_in_words, save, summary_and_figures, write_pages
-from sysid.cli.output import Output, collected_warnings, display_on, keep_for_document
+from sysid.cli.output import (
+    Output,
+    alone_in,
+    collected_warnings,
+    display_on,
+    keep_for_document,
+    replaced_in_words,
+    save,
+    summary_and_figures,
+    write_pages,
+)
 from sysid.cli.starting import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
+from sysid.nlp import GRACE
 from sysid.results.checkpoint import FILE_NAME as UNFINISHED
 from sysid.results.checkpoint import Checkpoint
 from sysid.results.version import __version__
-from sysid.search.session import GRACE, DeferredInterrupt
+from sysid.search.session import DeferredInterrupt
 
 _LOG = "sysid-error.log"
 

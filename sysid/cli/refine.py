@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid import catalogue
-from sysid.cli.files import alone_in, png, results_folder, table_as_csv, write_files
-from sysid.cli.output import Output
+from sysid.cli.output import Output, alone_in, png, results_folder, table_as_csv, write_files
 from sysid.cli.requests import check_trust, typed_module, with_problem_of
 from sysid.cli.starting import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.errors import InputError

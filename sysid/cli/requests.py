@@ -15,8 +15,7 @@ from typing import Any
 
 from sysid import catalogue
 from sysid.cli.arguments import TRUST
-from sysid.cli.files import results_folder
-from sysid.cli.output import Output
+from sysid.cli.output import Output, results_folder
 from sysid.errors import InputError, refuse, shown
 from sysid.files import recorded_test
 from sysid.results.checkpoint import FILE_NAME, Checkpoint, RunRequest

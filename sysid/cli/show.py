@@ -70,24 +70,11 @@ def run(options: argparse.Namespace, out: Output) -> int:
 def show(problem: Problem, name: str) -> str:
     """Describe a problem, and what its data determine, in lines of at most 120 columns.
 
-    Parameters
-    ----------
-    problem : Problem
-    name : str
-        As the first line calls it.
-
-    Returns
-    -------
-    str
-        Its test and strategy; a table of its variables; the unknowns a matrix; their values, IPOPT's units and
-        expected standard deviations at a point, which is the reference where the models can hold it, else what the
-        modal strategy finds where that applies, else the guess; and the rank of the Jacobian there, with the
-        directions that no record sees, in the problem's own names.
-
-    Raises
-    ------
-    InputError
-        Where the problem cannot be searched, or the Jacobian is finite at no point that was looked at.
+    Its test and strategy; a table of its variables; the unknowns a matrix; their values, IPOPT's units and expected
+    standard deviations at a point, which is the reference where the models can hold it, else what the modal strategy
+    finds where that applies, else the guess; and the rank of the Jacobian there, with the directions that no record
+    sees, in the problem's own names. Refused where the problem cannot be searched, or the Jacobian is finite at no
+    point that was looked at.
     """
     prepared = problem.prepared
     prepared.check()

@@ -8,21 +8,6 @@ from sysid.jobs.score import Compared, Move, Score, moves, scored
 from sysid.jobs.submission import submit
 
 __all__ = [
-    "Band",
-    "Compared",
-    "JobResult",
-    "Minimum",
-    "Move",
-    "NumberOfModes",
-    "Score",
-    "Spread",
-    "WithoutRun",
-    "WithoutSensor",
-    "cluster",
-    "distinct",
-    "moves",
-    "processes",
-    "scored",
-    "spreads",
-    "submit",
-]
+    "Band", "Compared", "JobResult", "Minimum", "Move", "NumberOfModes", "Score", "Spread", "WithoutRun",
+    "WithoutSensor", "cluster", "distinct", "moves", "processes", "scored", "spreads", "submit",
+]  # fmt: skip

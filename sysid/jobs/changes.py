@@ -209,11 +209,6 @@ def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> Stated
     and R. Tibshirani, An Introduction to the Bootstrap, 1993). With pseudo-values for records, as under Huber's loss,
     it is the noise under which squares scatter as that loss does: larger than that of the records by 1 / sqrt(0.95)
     without outliers, and by more with them, and so are the residuals of the draws.
-
-    Raises
-    ------
-    InputError
-        See `check_drawable`.
     """
     check_drawable(problem.stated)
     formulation, rng = problem.formulation, np.random.default_rng(random)

@@ -207,18 +207,11 @@ def each(
     executor: Executor | Callable[[], Executor] | None,
     lost: Callable[[Task, str], Answer],
 ) -> Iterator[Answer]:
-    """Answers to all tasks, as they come.
+    """Answers of a function at the top of a module to all tasks, as they come.
 
-    Parameters
-    ----------
-    function : callable
-        At the top of a module, so that a worker finds it.
-    tasks : sequence
-    executor : Executor, callable or None
-        None runs them here, one after the other. Of a function that makes an executor a new one is made where the last
-        one broke, and what was unfinished is submitted again; with an executor itself it is lost.
-    lost : callable
-        The answer to a task whose worker died or raised, and why.
+    Without an executor they run here, one after the other. Of a function that makes an executor a new one is made where
+    the last one broke, and what was unfinished is submitted again; with an executor itself it is lost. `lost` makes the
+    answer to a task whose worker died or raised, and why.
     """
     if executor is None:
         yield from map(function, tasks)

@@ -24,18 +24,6 @@ from sysid.plot.plots import (
 )
 
 __all__ = [
-    "base_force",
-    "base_forces",
-    "cmif",
-    "comparison",
-    "convergence",
-    "effective_masses",
-    "mac",
-    "matrices",
-    "minima",
-    "mode_shapes",
-    "overview",
-    "responses",
-    "stabilisation",
-    "transmissibility",
-]
+    "base_force", "base_forces", "cmif", "comparison", "convergence", "effective_masses", "mac", "matrices", "minima",
+    "mode_shapes", "overview", "responses", "stabilisation", "transmissibility",
+]  # fmt: skip

@@ -151,17 +151,8 @@ def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = No
 def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
     """A row for each quantity whose linear deviation is known: the ratio, 1 where the linear one is right.
 
-    Parameters
-    ----------
-    found : sequence of Spread
-        As `sysid.jobs.spreads` gives them.
-    count : int
-        Draws that they are of; the bars are what chance alone makes of so many, in 95 %.
-    title : str
-
-    Returns
-    -------
-    Figure
+    `found` is of `count` draws, as `sysid.jobs.spreads` gives it; the bars are what chance alone makes of so many, in
+    95 %.
     """
     known = [spread for spread in found if np.isfinite(spread.ratio)]
     figure = new_figure(7.2, 1.3 + 0.22 * len(known))
@@ -181,20 +172,9 @@ def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
 
 
 def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
-    """A row an identification: residuals, and beside them the steps of its quantities, or AIC and BIC.
+    """A row an identification, the result's own first: residuals, and beside them the steps of its quantities.
 
-    Parameters
-    ----------
-    rows : sequence of Compared
-        The result's own first.
-    title : str
-    part : bool
-        Whether they are of parts of the records, so that steps are told in standard deviations; else AIC and BIC are
-        drawn, above the least.
-
-    Returns
-    -------
-    Figure
+    Of parts of the records steps are told in standard deviations; else AIC and BIC are drawn, above the least.
     """
     figure = new_figure(8.6, 1.5 + 0.28 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)

@@ -441,12 +441,7 @@ def stick_model(
 ) -> tuple[Array, Array, list[tuple[int, int]]]:
     """Points of the sensors (p, 3), their motion by each sensor (p, 3, n_sensors), and pairs that a stick joins.
 
-    In the pairs `further` points (q, 3) count first.
-
-    Raises
-    ------
-    InputError
-        Where the sensors have no positions, or all the same.
+    In the pairs `further` points (q, 3) count first. Refused where the sensors have no positions, or all the same.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform

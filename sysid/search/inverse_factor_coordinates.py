@@ -29,8 +29,8 @@ from sysid.models.expressions import lower_triangle, triangle_entries
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import IterationMonitor, NonlinearProgram, product, time_too_short
 from sysid.problem.prepared import Prepared
-from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
-from sysid.search.modal_program import stated_totals
+from sysid.search.modal_coordinates import modes_of, spectrum_near, unknowns_of
+from sysid.search.modal_program import End, stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 
@@ -93,21 +93,10 @@ class InverseFactorError:
     The coordinates are one column: the entries of R, row by row, P by columns, the entries of N, row by row, where a
     base force was measured, the entries below the diagonal of the skew-symmetric S, log w (n,) and log zeta (n,).
 
-    Attributes
-    ----------
-    sizes : tuple of int
-        How many coordinates there are of R, P, N, S, and log w with log zeta.
-    value : casadi.Function
-        Coordinates and Psi_0 (n, n) to the squared error.
-    gradient : casadi.Function
-        Coordinates and Psi_0 to the squared error and its gradient.
-    hessian : casadi.Function
-        Coordinates and Psi_0 to the Hessian.
-    modes : casadi.Function
-        Coordinates and Psi_0 to mode shapes (n, n), participations (n, d) and rigid-body mass (d, d).
-    totals : casadi.Function
-        Entries of R, P and N to what is stated of totals beside a measured base force, each relative to its value and
-        zero where it is met; no rows where nothing is stated.
+    `sizes` tells how many there are of R, P, N, S, and log w with log zeta. Functions of the coordinates and Psi_0
+    (n, n) are `value`, `gradient` (the value beside it), `hessian`, and `modes`: shapes (n, n), participations (n, d)
+    and rigid-body mass (d, d). `totals` takes the entries of R, P and N to what is stated of totals beside a measured
+    base force, each relative to its value and zero where it is met; no rows where nothing is stated.
     """
 
     def __init__(self, problem: Prepared) -> None:

@@ -27,7 +27,8 @@ from sysid.problem.matrices import assemble
 from sysid.problem.prepared import HELD, LOOSE, Prepared
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
-from sysid.search.modal_coordinates import End, add_unknowns, fit_in_modes, frequencies
+from sysid.search.modal_coordinates import fit_in_modes, frequencies
+from sysid.search.modal_program import End, add_unknowns, fit_apart
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE
@@ -39,26 +40,14 @@ Coordinates = Literal["modal", "cholesky", "entries"]
 class LocalResult:
     """Result of the local phase.
 
-    Attributes
-    ----------
-    x : (n_variables,)
-        The problem's unknowns; where modes are free, only the damping is held by the box, and frequencies have windows
-        about those stated.
-    success : bool
-        IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off.
-    message : str
-        IPOPT's status and what else the user must know, such as a bound that the solution ends on.
-    curve : (iterations,)
-        Objective of each iterate, over all attempts.
-    stopped : BaseException or None
-        What the listener raised, or Ctrl-C; `x` is then the last iterate.
+    Where modes are free, only the damping in `x` is held by the box, and frequencies have windows about those stated.
     """
 
-    x: Array
-    success: bool
-    message: str
-    curve: Array
-    stopped: BaseException | None = None
+    x: Array  # the problem's unknowns, (n_variables,)
+    success: bool  # Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off
+    message: str  # IPOPT's status and what else the user must know, such as a bound that the solution ends on
+    curve: Array  # objective of each iterate, over all attempts
+    stopped: BaseException | None = None  # what the listener raised, or Ctrl-C; `x` is then the last iterate
 
 
 def solve(
@@ -104,29 +93,6 @@ def solve_or_read(problem: Prepared, x: Array, session: Session, **settings: Any
     if result.stopped is None and not session.cut_short:
         part.ended(lambda: {name: value for name, value in vars(result).items() if name != "stopped"})
     return result
-
-
-def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:
-    """The same end with the unknowns that enter no matrix fitted to the terms and constraints that they enter.
-
-    Where modes are free nothing connects them with the others.
-    """
-    formulation = problem.formulation
-    at = formulation.parts.damping.stop
-    if at == formulation.size or monitor.stopped is not None:
-        return end
-    z, auxiliary = NonlinearProgram(), formulation.unknowns[sum(map(len, formulation.of_models)) :]
-    start = np.clip(end.x[at:], formulation.lower[at:], formulation.upper[at:])
-    unknowns = ca.vertcat(ca.DM(end.x[:at]), add_unknowns(z, auxiliary, start))
-    constraints = formulation.constraints
-    if constraints.lower.size:
-        z.constrain(constraints.function(unknowns), constraints.lower, constraints.upper)
-    rows = ca.vertcat(ca.MX(0, 1), *(term.rows(unknowns) for term in formulation.beside))
-    best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations)
-    x = np.asarray(ca.Function("end", [z.z], [unknowns])(best)).ravel()
-    if status in SOLVED:
-        return end._replace(x=x)
-    return end._replace(x=x, status=status, remark=f"{end.remark or end.status}; that is of what enters no matrix")
 
 
 def _result(end: End, monitor: IterationMonitor) -> LocalResult:

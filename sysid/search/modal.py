@@ -31,11 +31,12 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.local import LocalResult, fit_apart, solve
-from sysid.search.modal_coordinates import End
+from sysid.search.local import LocalResult, solve
 from sysid.search.modal_program import (
+    End,
     Spectrum,
     Ties,
+    fit_apart,
     nearest_lumped,
     of_known_mass,
     solve_modes,
@@ -230,13 +231,12 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
         + ", ".join(f"{f:.4g}" for f in structure.natural_frequencies)
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
-    success, message = end.status in SOLVED or end.residual <= EXACT, ended_in_words(end.status)
-    message += f"; ended on a bound: {end.bounds}" * bool(end.bounds)
     modal = problem.modal[0]
-    if modal.by_modes and not modal.settled:
-        success, message = False, f"{message}; the fit of whole records did not settle: modes or noise still moved"
-    if monitor.is_over and end.residual > EXACT:
-        success, message = False, f"{message}; the time was over before every further fit was tried"
+    unsettled, late = modal.by_modes and not modal.settled, monitor.is_over and bool(end.residual > EXACT)
+    success = (end.status in SOLVED or end.residual <= EXACT) and not (unsettled or late)
+    message = ended_in_words(end.status) + f"; ended on a bound: {end.bounds}" * bool(end.bounds)
+    message += "; the fit of whole records did not settle: modes or noise still moved" * unsettled
+    message += "; the time was over before every further fit was tried" * late
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
     notes: tuple[Finding, ...] = ()
     if structure.at_sensors:

@@ -9,8 +9,7 @@ least-squares problem, and where that fits clearly better, the search starts aga
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import casadi as ca
 import numpy as np
@@ -19,25 +18,15 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
-from sysid.models.unknowns import Unknown, lower_of, scales_of, split, upper_of
+from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.modal_program import positive_part, solve_modes, stated_totals, to_stated_totals
+from sysid.search.modal_program import End, add_unknowns, positive_part, solve_modes, stated_totals, to_stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FREE, NEGLIGIBLE
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
-
-
-class End(NamedTuple):
-    """Where IPOPT ended: unknowns (n_variables,), objective, status, and bounds in words."""
-
-    x: Array
-    objective: float
-    status: str
-    bounds: str
-    remark: str = ""
 
 
 def fit_in_modes(problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
@@ -152,19 +141,3 @@ def _regular_inverse(phi: Array) -> Array:
     """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
     u, s, vt = np.linalg.svd(phi)
     return (vt.T / np.maximum(s, NEGLIGIBLE * s[0])) @ u.T
-
-
-def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, held: slice = slice(0, 0)) -> ca.MX:
-    """The unknowns as expressions of new ones in units of their scale, those in `held` as numbers."""
-    pieces, at = [], 0
-    for unknown, values in zip(unknowns, split(unknowns, x), strict=True):
-        if held.start <= at < held.stop:
-            pieces.append(ca.MX(ca.DM(values)))
-        else:
-            unit = scales_of([unknown], values)  # its start, or a part of its range where that is larger
-            unit = np.where(unit > 0, unit, 1.0)
-            labels = [label.removeprefix(unknown.title) for label in unknown.labels]
-            scaled = z.variable(unknown.title, values / unit, unknown.lower / unit, unknown.upper / unit, labels)
-            pieces.append(scaled * ca.DM(unit))
-        at += unknown.size
-    return ca.vertcat(*pieces)

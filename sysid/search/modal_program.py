@@ -13,7 +13,8 @@ nearest to a lumped mass is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -33,6 +34,8 @@ from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge,
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
 from sysid.models.expressions import lower_entries, lower_triangle, triangle_entries
+from sysid.models.spectrum import SOLVED
+from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.nlp import IterationMonitor, NonlinearProgram, NumpyFunction, product
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
@@ -40,6 +43,16 @@ from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
+
+
+class End(NamedTuple):
+    """Where IPOPT ended: unknowns (n_variables,), objective, status, and bounds in words."""
+
+    x: Array
+    objective: float
+    status: str
+    bounds: str
+    remark: str = ""
 
 
 def solve_modes(
@@ -116,15 +129,8 @@ def solve_modes(
 class ModalResidual:
     """Weighted residual as CasADi expressions, its shapes eliminated.
 
-    Attributes
-    ----------
-    phi : (n, m)
-        The best shapes.
-    left : (n, 2 L)
-        Weighted errors of the accelerations, real parts beside imaginary ones.
-    force_left : (d, 2 L), or None
-    value :
-        Their sum of squares.
+    `phi` (n, m) are the best shapes, `left` (n, 2 L) the weighted errors of the accelerations, real parts beside
+    imaginary ones, `force_left` (d, 2 L), or None, those of the force, and `value` is their sum of squares.
     """
 
     def __init__(
@@ -194,13 +200,7 @@ class EstimateResidual:
     """Misfit of modes to an estimate, in units of its noise and of the records, the best shapes eliminated.
 
     Half a chi-squared rises by ``|R (theta - estimate)|²``, with ``R' R`` the information; shapes enter it linearly.
-
-    Attributes
-    ----------
-    phi : (n, m)
-        The best shapes.
-    value :
-        The sum of squares.
+    `phi` (n, m) are the best shapes, `value` is the sum of squares.
     """
 
     def __init__(self, modal: ModalEstimate, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX) -> None:
@@ -293,19 +293,10 @@ def to_stated_totals(
     """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
 
     Scaling all modal masses by one t changes no response; the remainder is invisible in accelerations. It keeps its
-    correlations, and takes what mass the modes leave.
-
-    Parameters
-    ----------
-    P : (m, m)
-        Inverse of the mode shapes at the degrees of freedom.
-    gamma, G : (m, d)
-        Participations, and rigid motion of the degrees of freedom.
-    groups : (m,)
-        Base direction of each degree of freedom, -1 for none.
-    scaled : bool
-        Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
-        less than they make, is then what they make.
+    correlations, and takes what mass the modes leave. P (m, m) is the inverse of the mode shapes at the degrees of
+    freedom, gamma and G (m, d) are participations and rigid motion, `groups` (m,) base directions, -1 for none. Where
+    known masses have `scaled` the modal masses already t is one; a total that is not stated, or less than they make, is
+    then what they make.
     """
     spare = 0.0 if problem.measurement.force is not None else _LEAST_SHARE  # a force tells what the base has
     if problem.rigid_total is not None:
@@ -391,3 +382,42 @@ def of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
     rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
     t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
     return np.maximum(t, np.finfo(float).eps * t.max())
+
+
+def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:
+    """The same end with the unknowns that enter no matrix fitted to the terms and constraints that they enter.
+
+    Where modes are free nothing connects them with the others.
+    """
+    formulation = problem.formulation
+    at = formulation.parts.damping.stop
+    if at == formulation.size or monitor.stopped is not None:
+        return end
+    z, auxiliary = NonlinearProgram(), formulation.unknowns[sum(map(len, formulation.of_models)) :]
+    start = np.clip(end.x[at:], formulation.lower[at:], formulation.upper[at:])
+    unknowns = ca.vertcat(ca.DM(end.x[:at]), add_unknowns(z, auxiliary, start))
+    constraints = formulation.constraints
+    if constraints.lower.size:
+        z.constrain(constraints.function(unknowns), constraints.lower, constraints.upper)
+    rows = ca.vertcat(ca.MX(0, 1), *(term.rows(unknowns) for term in formulation.beside))
+    best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations)
+    x = np.asarray(ca.Function("end", [z.z], [unknowns])(best)).ravel()
+    if status in SOLVED:
+        return end._replace(x=x)
+    return end._replace(x=x, status=status, remark=f"{end.remark or end.status}; that is of what enters no matrix")
+
+
+def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, held: slice = slice(0, 0)) -> ca.MX:
+    """The unknowns as expressions of new ones in units of their scale, those in `held` as numbers."""
+    pieces, at = [], 0
+    for unknown, values in zip(unknowns, split(unknowns, x), strict=True):
+        if held.start <= at < held.stop:
+            pieces.append(ca.MX(ca.DM(values)))
+        else:
+            unit = scales_of([unknown], values)  # its start, or a part of its range where that is larger
+            unit = np.where(unit > 0, unit, 1.0)
+            labels = [label.removeprefix(unknown.title) for label in unknown.labels]
+            scaled = z.variable(unknown.title, values / unit, unknown.lower / unit, unknown.upper / unit, labels)
+            pieces.append(scaled * ca.DM(unit))
+        at += unknown.size
+    return ca.vertcat(*pieces)

@@ -31,14 +31,9 @@ _SHARE = 0.05  # of the time that writing may take
 class Journal:
     """The long parts of a search in their order.
 
-    Parameters
-    ----------
-    write : callable, optional
-        Keeps the entries that it is given; without it nothing is kept.
-    entries : dict, optional
-        Those of an earlier run of the same search: name and content of each part, by its number as a text.
-    every : float
-        s between two writings, at least; more where writing takes long.
+    `write` keeps the entries that it is given, at least `every` so many s, more where writing takes long; without it
+    nothing is kept. `entries` are those of an earlier run of the same search: name and content of each part, by its
+    number as a text.
     """
 
     def __init__(
@@ -340,8 +335,8 @@ class Session:
         self._check_limits()
 
     @contextlib.contextmanager
-    def fitting(self, share: float = 0.8) -> Iterator[FitMonitor]:
-        """Monitor of the fit of modes, asked at any time; it has a share of the time, the rest is for what follows."""
+    def fit_monitor(self, share: float = 0.8) -> Iterator[FitMonitor]:
+        """Monitor of the fit of modes, asked at any time; the fit has a share of the time, what follows the rest."""
         monitor = FitMonitor(self.preparing, self._check_fit, None if self.left is None else share * self.left)
         with regularly(monitor.check):
             yield monitor

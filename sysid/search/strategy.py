@@ -131,40 +131,22 @@ class History:
 class Outcome:
     """Where a search ended.
 
-    Attributes
-    ----------
-    structure : Structure
-    x : (n_variables,) or None
-        The problem's unknowns that stand for the structure; None where the modal strategy chose other degrees of
-        freedom than the sensors.
-    strategy : str
-    success : bool
-        Of the last solver.
-    message : str
-    history : History
-    stopped : BaseException or None
-        What ended it early.
-    alternatives : tuple of (n_variables,)
-        Other unknowns that explain the data as well.
-    good : bool
-        The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
-    unanimous : bool
-        Every start ended there: what is left is no local minimum's, and no other strategy needs to follow.
-    findings : tuple of Finding
-        Mistakes that were named before or by the search, contradictions that it met, and what should be known of it.
+    `x` (n_variables,) stands for the structure; it is None where the modal strategy chose other degrees of freedom than
+    the sensors. No other strategy needs to follow where the fit is as `good` as the data let it be, as far as the
+    strategy can tell, or where every start ended there (`unanimous`): what is left is then no local minimum's.
     """
 
     structure: Structure
     x: Array | None
     strategy: str
-    success: bool
+    success: bool  # of the last solver
     message: str
     history: History
-    stopped: BaseException | None = None
-    alternatives: tuple[Array, ...] = ()
+    stopped: BaseException | None = None  # what ended it early
+    alternatives: tuple[Array, ...] = ()  # other unknowns that explain the data as well
     good: bool = True
     unanimous: bool = False
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # mistakes and contradictions that were met, and what should be known of it
 
     def with_note(self, sentence: str) -> Outcome:
         """The same, and a sentence on how it was done."""

@@ -59,16 +59,10 @@ def held_spectrum_objective(
 class HeldSpectrumObjective:
     """Squared relative residual of the records, (count, n_variables) swarm coordinates to (count,).
 
-    Parameters
-    ----------
-    term : TestTerm
-        The problem's own test, or one in its place.
-    spectrum : (n,), rad/s
-        All natural frequencies, which take the place of each candidate's own.
-    expansion : casadi.Function
-        The swarm's coordinates to damping ratios, and what `sysid.problem.batch.batch_modes` takes.
-    threads : int, optional
-        The result does not depend on it, to the last bit; the machine's processors, at most eight, by default.
+    Of the problem's own test, or one in its place. `spectrum` (n,), rad/s, are all natural frequencies, which take the
+    place of each candidate's own; `expansion` takes the swarm's coordinates to damping ratios, and to what
+    `sysid.problem.batch.batch_modes` takes. The result does not depend on the number of threads, to the last bit; these
+    are the machine's processors, at most eight, by default.
     """
 
     def __init__(

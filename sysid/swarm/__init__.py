@@ -9,10 +9,5 @@ from .minimize import StopReason, SwarmProgress, minimize_swarm
 from .particles import ParticleSwarm
 
 __all__ = [
-    "EvolutionaryState",
-    "ParticleSwarm",
-    "StopReason",
-    "SwarmProgress",
-    "SwarmSettings",
-    "minimize_swarm",
-]
+    "EvolutionaryState", "ParticleSwarm", "StopReason", "SwarmProgress", "SwarmSettings", "minimize_swarm",
+]  # fmt: skip

@@ -35,23 +35,8 @@ class Box:
 
     Particles are points of this cube, and all distances and velocities of the swarm are counted in it; a fixed variable
     (lower == upper) has no range, is left out of distances, and is returned exactly. Conversions clip to the bounds;
-    what a particle's velocity does there is told by `ParticleSwarm`.
-
-    Parameters
-    ----------
-    bounds : (n_dim, 2) array-like or scipy.optimize.Bounds
-        Lower and upper bound of each variable, finite.
-
-    Attributes
-    ----------
-    lower, upper : (n_dim,) array
-    free : (n_free,) array of int
-        Indices of the variables with lower < upper.
-
-    Raises
-    ------
-    InputError
-        If the shape is wrong, a bound is not finite, or a lower bound is above its upper bound.
+    what a particle's velocity does there is told by `ParticleSwarm`. `bounds` are (n_dim, 2) array-like, or
+    scipy.optimize.Bounds, and finite; `free` (n_free,) are the indices of the variables with lower < upper.
     """
 
     def __init__(self, bounds: Any) -> None:

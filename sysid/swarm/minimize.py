@@ -35,13 +35,7 @@ class StopReason(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class StopRules:
-    """The stop rules of one search; see `minimize_swarm` for each.
-
-    Raises
-    ------
-    InputError
-        If a rule cannot be used.
-    """
+    """The stop rules of one search; see `minimize_swarm` for each."""
 
     max_iterations: int
     max_evaluations: int | None
@@ -52,10 +46,10 @@ class StopRules:
 
     def __post_init__(self) -> None:
         whole_number("max_iterations", self.max_iterations, at_least=1)
-        if self.max_evaluations is not None:
-            whole_number("max_evaluations", self.max_evaluations, at_least=1)
-        if self.stall_iterations is not None:
-            whole_number("stall_iterations", self.stall_iterations, at_least=1)
+        counts = {"max_evaluations": self.max_evaluations, "stall_iterations": self.stall_iterations}
+        for name, count in counts.items():
+            if count is not None:
+                whole_number(name, count, at_least=1)
         if self.max_time is not None:
             as_float("max_time", self.max_time, "zero or more seconds, or None for no limit,", at_least=0, finite=False)
         if self.target is not None:
@@ -68,15 +62,14 @@ class StopRules:
 
     def reason(self, swarm: ParticleSwarm, seconds: float) -> StopReason | None:
         """Return the first rule that ends the search after an iteration, or None to go on."""
-        if self.target is not None and math.isfinite(swarm.best_cost) and swarm.best_cost <= self.target:
-            return StopReason.TARGET
-        if self.stall_iterations is not None and stalled(swarm.history, self.stall_iterations, self.stall_tolerance):
-            return StopReason.STALL
-        if swarm.nit >= self.max_iterations:
-            return StopReason.MAX_ITERATIONS
-        if self.max_time is not None and seconds >= self.max_time:
-            return StopReason.MAX_TIME
-        return None
+        best, idle = swarm.best_cost, self.stall_iterations
+        holds = {
+            StopReason.TARGET: self.target is not None and math.isfinite(best) and best <= self.target,
+            StopReason.STALL: idle is not None and stalled(swarm.history, idle, self.stall_tolerance),
+            StopReason.MAX_ITERATIONS: swarm.nit >= self.max_iterations,
+            StopReason.MAX_TIME: self.max_time is not None and seconds >= self.max_time,
+        }
+        return next((reason for reason, applies in holds.items() if applies), None)
 
     def message(self, reason: StopReason, swarm: ParticleSwarm) -> str:
         """Message that says why the search ended, and what to do next."""

@@ -1,5 +1,6 @@
 """Fits of whole records that Ctrl-C, a callback or the time limit stops, from the records to the stored result."""
 
+import contextlib
 import importlib
 import os
 import signal
@@ -278,8 +279,9 @@ def test_the_time_limit_ends_a_fit_that_has_something_to_keep(storeys, monkeypat
     assert [one.kind for one in result.open_findings] == ["modes not all tried"]
 
 
+@contextlib.contextmanager
 def _at_once(session):
-    return FitMonitor(session.preparing, session._check_fit, 0.0)
+    yield FitMonitor(session.preparing, session._check_fit, 0.0)
 
 
 def test_damaged_fits_in_a_file_are_refused(storeys):

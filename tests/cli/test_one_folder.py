@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sysid.cli import main as cli
-from sysid.cli.files import alone_in
+from sysid.cli.output import alone_in
 
 
 @pytest.fixture
