@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.pole_functions import factorised, unit_columns
+from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
@@ -145,25 +145,27 @@ class _Fit:
 def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     """Linear least squares on given poles; the slopes per rad/s."""
     direct = records.basis(_without_poles(records.freq), records.driven)
-    functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True).dense()]))
-    Q, R = factorised(functions)
-    answered = Q.T @ records.data
-    left = records.data - Q @ answered
+    functions = records.functions(omega, ratios, velocity=True)
+    basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
+    answered = basis.answers(records.data)
+    left = records.data - basis.times(answered)
     inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]
-    beta, known = inverse @ answered, direct.shape[1]
-    freedom = max(len(left) - functions.shape[1], 1)
+    beta, count = inverse @ answered, len(R)
+    first = count - functions.shared.shape[1]  # of the poles, behind the terms without them and those of one run each
+    terms = slice(first - direct.shape[1], first)
+    freedom = max(len(left) - count, 1)
     level = np.maximum(np.linalg.norm(left, axis=0), ROUND_OFF * np.linalg.norm(records.data, axis=0))
     tail = records.basis((records.freq[0] / records.freq)[None] ** 2 + 0j, records.driven)
-    beyond = np.linalg.qr(tail - Q @ (Q.T @ tail))[0]
-    noise = records.noise(left, functions.shape[1] * left.shape[1])
+    beyond = np.linalg.qr(tail - basis.times(basis.answers(tail)))[0]
+    noise = records.noise(left, count * left.shape[1])
     gained = float(np.sum((beyond.T @ left) ** 2))
-    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1])
+    shared = noise / records.variance(float(np.sum(left**2)), count * left.shape[1])
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
-    of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
+    of_modes = beta[first:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
     return _Fit(
-        turn * _by_sensor(records, of_terms(beta[:known])),
-        turn * _deviations(records, of_terms(inverse[:known]), level * np.sqrt(shared / freedom)),
+        turn * _by_sensor(records, of_terms(beta[terms])),
+        turn * _deviations(records, of_terms(inverse[terms]), level * np.sqrt(shared / freedom)),
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES),
         float(np.linalg.norm(left) / np.sqrt(records.size)),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import Lines, dots
+from sysid.modal_analysis.modal_model import Lines
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.residual_tests import line_blocks, uneven
@@ -167,6 +167,9 @@ def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, lev
     moved = np.any(inputs, axis=1)
     u = inputs[moved]
     errors = (weighed.whitened_residual[:, None] * u.conj()).reshape(-1, w.size)
+    by_line = np.stack([errors.real.T, errors.imag.T], axis=1)  # (L, 2, ...): those of some lines stand together
+    hidden = np.concatenate([V.real, V.imag]).transpose(2, 1, 0)
+    covered = (hidden @ hidden.swapaxes(1, 2)).reshape(w.size, -1)
     pairs = (u[:, None] * u.conj()).real.reshape(-1, w.size)
     for block in blocks:
         omega, ratios = trials.omega[block], trials.ratios[block]
@@ -178,17 +181,18 @@ def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, lev
         g = gains(w[near] / (2 * np.pi), omega, ratios)
         g *= np.abs(w[near] - omega[:, None]) <= reach
         power = g.real**2 + g.imag**2
-        trials.gradient[block][:, :, moved] += dots(g, errors[:, near]).reshape(omega.size, -1, len(u))
+        trials.gradient[block][:, :, moved] += (g.view(float) @ by_line[near].reshape(2 * g.shape[1], -1)).reshape(
+            omega.size, -1, len(u)
+        )
         trials.power[block][np.ix_(np.arange(omega.size), moved, moved)] += (power @ pairs[:, near].T).reshape(
             omega.size, len(u), len(u)
         )
         # So many lines in a half-power width tell the mean covariance.
         step = max(1, int(np.count_nonzero(g[0])) // int(2 * _REACH * 16))
         thin = step * power[:, ::step]
-        hidden = (V[:, :, near][:, :, ::step].swapaxes(0, 1)[None] * np.sqrt(thin)[:, None, None]).view(float)
-        hidden = hidden.reshape(omega.size, len(square), -1)
+        of_base = (thin @ covered[near][::step]).reshape(-1, len(square), len(square))
         total = thin.sum(axis=1)
-        trials.weights[block] += np.diag(square) * total[:, None, None] - hidden @ hidden.swapaxes(1, 2)
+        trials.weights[block] += np.diag(square) * total[:, None, None] - of_base
         strength[block] += total
 
 

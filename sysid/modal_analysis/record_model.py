@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,55 +247,50 @@ class Chunk(Lines):
 
     def columns(self) -> Columns:
         """Columns of all channels by the spectra."""
-        every = np.array([self.coefficients(channel) for channel in range(self.records.channels)])
-        row, spectrum = np.nonzero(np.any(every != 0, axis=0))
+        channels = range(self.records.channels)
+        entries = [(np.full(row.size, at), row, *rest) for at in channels for row, *rest in self.entries(at)]
+        channel, row, spectrum, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+        width = int(spectrum.max()) + 1
+        places, at = np.unique(row * width + spectrum, return_inverse=True)
+        row, spectrum = np.divmod(places, width)
+        every = np.zeros((places.size, len(channels)))
+        every[at, channel] = value
         unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
         layers = []
         for depth in range(count.max()):
             column = np.flatnonzero(count > depth)
             entry = starts[column] + depth
-            layers.append(Layer(column, spectrum[entry], every[:, row[entry], spectrum[entry]].T.copy()))
+            layers.append(Layer(column, spectrum[entry], every[entry]))
         return Columns(unknowns, layers)
 
-    def coefficients(self, channel: int) -> Array:
-        """Coefficients of the columns of a channel's Jacobian by the spectra, (p, spectra)."""
+    def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """Entries of the columns of a channel's Jacobian by the spectra: unknowns, spectra and values, (k,) each."""
         model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
-        k = np.arange(m)
+        k, beside, traces = np.arange(m), np.arange(d), np.arange(TRACES)
         shapes = self.shapes[channel]
-        spectra = m + m * d + 2 * m + d + 2 * m * (self.at_ends is not None) + TRACES + d * model.gains
-        C = np.zeros((model.size, spectra))
-
-        def put(row: NDArray[Any], col: NDArray[Any], value: Array) -> None:
-            C[row, col] += value
-
         first = np.cumsum([0, m, m * d, 2 * m, d])  # of q, g u, slopes, u; then transients, traces
         if channel < n:
-            put(index.phi.start + channel * m + k, k, np.ones(m))
+            yield index.phi.start + channel * m + k, k, np.ones(m)
         else:
-            put(index.gamma.start + k * d + channel - n, k, np.ones(m))
+            yield index.gamma.start + k * d + channel - n, k, np.ones(m)
             for at, (a, b) in enumerate(index.pairs):
                 if channel - n in (a, b):
-                    put(index.rigid[[at]], np.array([first[3] + (b if channel - n == a else a)]), np.ones(1))
-        put(index.gamma.start + np.arange(m * d), first[1] + np.arange(m * d), np.repeat(shapes, d))
-        put(index.log_omega.start + k, first[2] + k, shapes)
-        put(index.log_ratios.start + k, first[2] + m + k, shapes)
+                    yield index.rigid[[at]], first[[3]] + (b if channel - n == a else a), np.ones(1)
+        yield index.gamma.start + np.arange(m * d), first[1] + np.arange(m * d), np.repeat(shapes, d)
+        yield index.log_omega.start + k, first[2] + k, shapes
+        yield index.log_ratios.start + k, first[2] + m + k, shapes
         last = first[4]
         if self.at_ends is not None:
-            two = np.arange(2)
-            runs = 2 * len(model.moving)
-            row = model.kept + k[:, None] * runs + self.at_ends.start + two
-            put(row, last + 2 * k[:, None] + two, np.repeat(shapes, 2).reshape(m, 2))
+            runs, pair = 2 * len(model.moving), np.tile([0, 1], m)
+            row = model.kept + np.repeat(k, 2) * runs + self.at_ends.start + pair
+            yield row, last + np.arange(2 * m), np.repeat(shapes, 2)
             last = last + 2 * m
         first_trace = model.kept + model.n_ends + (self.run.number * model.channels + channel) * TRACES
-        put(first_trace + np.arange(TRACES), last + np.arange(TRACES), np.ones(TRACES))
-        last = last + TRACES
-        if model.gains:
-            beside = np.arange(d)
-            if channel < n:
-                put(model.n_fit + channel * d + beside, first[3] + beside, np.ones(d))
-                put(model.n_fit + (n + channel) * d + beside, last + beside, np.ones(d))
-        return C
+        yield first_trace + traces, last + traces, np.ones(TRACES)
+        if model.gains and channel < n:
+            yield model.n_fit + channel * d + beside, first[3] + beside, np.ones(d)
+            yield model.n_fit + (n + channel) * d + beside, last + TRACES + beside, np.ones(d)
 
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""
@@ -307,10 +302,12 @@ class Chunk(Lines):
         """All products of these lines; unknowns as in `columns`."""
         weighed, root = self.weighed(levels), np.sqrt(self.run.weight)
         spectra = root * self.spectra(weighed.base)
-        hidden = np.zeros((columns.unknowns.size,) * 2)
-        for part in self.covered(levels):
-            seen = columns.seen(part.conj(), spectra)
-            hidden += dots(seen, seen)
+        hidden, covered = np.zeros((columns.unknowns.size,) * 2), self.covered(levels).conj()
+        step = 1 + 2**19 // columns.unknowns.size  # lines, of which columns stay in a processor's cache
+        for at in range(0, self.run.w.size, step):
+            for part in covered[:, :, at : at + step]:
+                seen = columns.seen(part, spectra[:, at : at + step])
+                hidden += dots(seen, seen)
         cross = dots(spectra, root * weighed.whitened_residual)
         return Sums(dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 
