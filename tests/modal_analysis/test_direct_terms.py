@@ -32,6 +32,16 @@ def test_without_noise_they_are_the_matrices_of_the_structure(seed):
     assert not terms.below
 
 
+def test_a_line_at_0_hz_which_no_mode_below_the_others_answers_changes_nothing():
+    truth = random_structure(0, n=3, d=1)
+    lines = np.concatenate([[0.0], frequency_lines(truth)])
+    terms = direct_terms(simulate(truth, lines, force=True))
+    np.testing.assert_allclose(terms.rigid, truth.rigid_body, atol=1e-6)
+    assert not terms.below
+    with_mode_below = lines[(lines == 0) | (lines > 1.5 * truth.natural_frequencies[0])]
+    assert direct_terms(simulate(truth, with_mode_below, noise=1e-4, rng=0)).below
+
+
 def test_errors_are_of_the_size_of_their_deviations():
     truth = random_structure(1, n=5, d=2)
     off = []
