@@ -292,21 +292,19 @@ def _noise(it: Identification) -> str:
     caption += (
         "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
     )
-    return table(("channel", *NOISE_COLUMNS), rows, caption) if rows else ""
+    return table(("channel", *NOISE_COLUMNS), rows, caption)
 
 
 def _gains(it: Identification) -> str:
     """The gain of each sensor as the records show it."""
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
-    head, found = ["sensor", "gain", "±"], gains_of_sensors(it)
-    rows = [[g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain)] for g in found]
-    if it.determined and any(np.isfinite(g.worth) for g in found):  # else M_SS has no deviation
-        head.append("1 % moves M_SS by, deviations")
-        caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
-        for row, gain in zip(rows, found, strict=True):
-            row.append(number(gain.worth, 2))
-    return table(head, rows, caption) if rows else ""
+    found = gains_of_sensors(it)
+    priced = it.determined and any(np.isfinite(g.worth) for g in found)  # else M_SS has no deviation
+    caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
+    head = ("sensor", "gain", "±", *["1 % moves M_SS by, deviations"] * priced)
+    rows = [(g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain), *[number(g.worth, 2)] * priced) for g in found]
+    return table(head, rows, caption)
 
 
 def _outliers(it: Identification) -> str:

@@ -91,16 +91,15 @@ def summary(it: Answer) -> str:
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
         rest += _ranges(it)
     lines += ["besides:"] * bool(rest) + rest
-    lines += [_NOT_COMPUTED] if it.hurried else []
+    lines += [_NOT_COMPUTED] * it.hurried
     lines.append(f"search: {it.message}")
-    return "\n".join(_folded(line) for line in lines)
+    return "\n".join(folded(line) for line in lines)
 
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
     rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
-    head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
-    return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
+    return _table((f"noise {noise_source(it)}", *NOISE_COLUMNS), rows)
 
 
 def _gains(it: Answer) -> list[str]:
@@ -110,6 +109,11 @@ def _gains(it: Answer) -> list[str]:
         for g in gains_of_sensors(it)
     ]
     head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")
+    return _table(head, rows)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table; nothing without rows, or with too many of them for a terminal."""
     return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
 
 
@@ -222,7 +226,7 @@ def _mode_table(it: Answer) -> list[str]:
         lines = in_columns(zip(*columns, *masses, strict=True))
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
-    notes += ["~ one of many values that fit as well"] if many.any() else []
+    notes += ["~ one of many values that fit as well"] * bool(many.any())
     return [*lines, "; ".join(notes), *missing_mass(it)]
 
 
@@ -237,18 +241,16 @@ def _deck_masses(it: Answer) -> list[str]:
 
 def _unknowns(it: Answer) -> list[str]:
     """Table of the unknowns that mean something by themselves, where there are some and not too many."""
-    rows = unknown_rows(it)
-    if not 0 < len(rows) <= MANY:
-        return []
     computed = it.quick_uncertainty is not None
     cells = [
         (
             row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit,
             row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}",
         )
-        for row in rows
+        for row in unknown_rows(it)
     ]  # fmt: skip
-    return [*in_columns([("unknown", "value", "+- (95 %)", "unit", "search space"), *cells]), ""]
+    lines = _table(("unknown", "value", "+- (95 %)", "unit", "search space"), cells)
+    return [*lines, *[""] * bool(lines)]
 
 
 def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
@@ -279,7 +281,7 @@ def _ranges(it: Answer) -> Iterator[str]:
         yield f"  - over all these models the diagonal entries are {', '.join(words)}"
 
 
-def _folded(line: str) -> str:
+def folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     if len(line) <= WIDTH:
         return line

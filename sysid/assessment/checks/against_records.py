@@ -56,7 +56,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
-    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (2 if velocity else 1):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (1 + velocity):
         return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
@@ -96,14 +96,19 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible, whose, figure = float(np.sqrt(free.squared_error / records.size)), "its poles", "free residues"
+    possible, whose, figure = (
+        max(float(np.sqrt(free.squared_error / records.size)), EXACT),
+        "its poles",
+        "free residues",
+    )
     wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
-    if misfit <= MISFIT * max(possible, EXACT):
+    if misfit <= MISFIT * possible:
         poles = None if formulation.free_modes else PolesAndResidues.of(test)
-        possible = np.inf if poles is None else poles.of_accelerations
+        if poles is None:
+            return
+        possible = max(poles.of_accelerations, EXACT)
         whose, figure = "the poles of the data", "poles of the data"
         wrong = "the form of its mass, stiffness or damping, recovery, or a bound is not the structure's"
-    possible = max(possible, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,

@@ -92,12 +92,10 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
 def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectTerms]:
     """Sensors whose records are late against the base's, and the terms of the records without that delay."""
     total = np.zeros(test.n_sensors)
-    first: Array | None = None
     for _ in range(3):  # times that a delay is taken off
         found = _delays(test, terms)
         if found is None:
             break
-        first = found if first is None else first
         total += found
         if test.is_whole:  # a record turned by its spectrum begins with its end
             break
@@ -106,9 +104,9 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
         if mended is None or mended.misfit > AS_GOOD * terms.misfit:
             return [], terms
         terms = mended
-    if first is None:
-        return [], terms
     which = np.flatnonzero(total)
+    if not which.size:
+        return [], terms
     of_all = which.size == np.count_nonzero(np.any(test.rigid_body, axis=1)) and which.size > 1
     who = "the records of all sensors are" if of_all else f"the record of {_names(test, which)} is"
     delay = float(np.mean(total[which]))
@@ -385,7 +383,7 @@ def mistakes_before_search(prepared: Prepared) -> Iterator[Finding]:
     search would be in vain.
     """
     problem, declared = prepared.stated, prepared.stated.declared
-    tests = [problem.measurement] if problem.misfit is None else []
+    tests = [problem.measurement] * (problem.misfit is None)
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     found = [_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests]
     for one in of_tests(found):

@@ -95,7 +95,7 @@ def lines_left_out(context: Context) -> Iterator[Finding]:
     """Lines are left out for all channels, as a record holds NaN there."""
     problem, formulation = context.problem, context.problem.formulation
     # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
-    fitted = [problem.measurement] if formulation.fits_records else []
+    fitted = [problem.measurement] * formulation.fits_records
     tests = [*fitted, *(term.test for term in formulation.further_tests)]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:
