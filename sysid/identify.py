@@ -20,8 +20,7 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
-from sysid.results.judgement import judge
-from sysid.results.stated_masses import with_stated_masses
+from sysid.results.judgement import judge, with_stated_masses
 from sysid.search import robust
 from sysid.search.auto import InTurn, check_strategy, choose
 from sysid.search.deadline import regularly
