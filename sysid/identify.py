@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks import check_records, mistakes_of_poor_fit
+from sysid.assessment.checks.against_records import exchanged_sensors
+from sysid.assessment.checks.mistakes import check_records
 from sysid.assessment.checks.model_error import changing
 from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
 from sysid.finding import Finding
@@ -105,7 +106,7 @@ def identify(
             chosen, why = choose(strategy, prepared, start)
             robust.check_local_phase(prepared, chosen)
             follow = strategy == "auto" and not named
-            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow=follow)
+            in_turn = InTurn(prepared.screened, session, start, exchanged_sensors, follow=follow)
             outcome, why = in_turn.run(chosen, why)
             outcome = robust.fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)

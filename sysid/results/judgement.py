@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.checks import OF_THE_END, QUICK, run
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK
+from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.gains import assumed, rests_on
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.information import Index
@@ -56,7 +56,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
     try:
         with within(session.left):
             known = determine(prepared.screened, end.structure, end.x, end.alternatives)
-            run(context)
+            run(context, CHECKS)
         open_ = cautions(known.findings)
         if verdict.success and known.judged_by == BY_RANK and not (open_ or contradicting(context.found)):
             end = with_other_answers(prepared, end, session)

@@ -1,18 +1,13 @@
 """All checks of records and of fits: `CHECKS`, in the order of their weight.
 
 A check looks at a `Context` and yields findings; what it is about stands in the first line of its docstring, of which
-the table in docs/mistakes.md is made. Before a search the records alone are looked at (`check_records`).
+the table in docs/mistakes.md is made. Before a search the records alone are looked at (`mistakes.check_records`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from sysid.assessment.checks import against_records, gains, mistakes, model_error, search_end, stated
-from sysid.assessment.checks.context import Check, Context, Ended
-from sysid.errors import refuse
-from sysid.finding import Finding, Severity
-from sysid.problem.prepared import Prepared
+from sysid.assessment.checks.context import Check
 
 CHECKS: tuple[Check, ...] = (
     mistakes.wrong_records,
@@ -45,31 +40,3 @@ OF_THE_END: tuple[Check, ...] = (
     search_end.no_solution,
 )  # whether a search ended at a fit
 QUICK: tuple[Check, ...] = (mistakes.wrong_records, *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])
-
-
-def run(context: Context, checks: Iterable[Check] = CHECKS) -> list[Finding]:
-    """Run checks one after the other; what they found is added to the context, each finding once."""
-    for check in checks:
-        for one in check(context):
-            if one not in context.found:
-                context.found.append(one)
-    return context.found
-
-
-def check_records(problem: Prepared) -> tuple[Finding, ...]:
-    """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
-
-    Raises
-    ------
-    InputError
-        Where one is blocking, so that a search would be in vain.
-    """
-    found = tuple(mistakes.mistakes_before_search(problem))
-    refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
-    return found
-
-
-def mistakes_of_poor_fit(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
-    """Sensors that were swapped, where that explains what a search leaves, so that no other would do better."""
-    _, pressed = stated.pressure_of(problem, end)  # what bounds leave may look like swapped sensors
-    return against_records.exchanged_sensors(problem, end.structure, wholly=pressed.explains)

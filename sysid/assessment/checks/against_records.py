@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context, of_tests
+from sysid.assessment.checks.context import Context, Ended, of_tests
 from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
-from sysid.assessment.checks.stated import MISFIT, force_misfit
+from sysid.assessment.checks.stated import MISFIT, force_misfit, pressure_of
 from sysid.errors import InputError
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
@@ -344,12 +344,12 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
     return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"
 
 
-def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
-    """Two sensors that stand in each other's place, by the best fit to the records; none where the model cannot tell.
+def exchanged_sensors(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
+    """Two sensors that stand in each other's place, so that no other search would do better; none where none can tell.
 
-    `wholly`: the exchange must leave no more than free residues do, as there is another cause of the misfit.
+    Where bounds explain the misfit as well, the exchange must leave no more than free residues do.
     """
-    formulation, test = problem.formulation, problem.measurement
+    formulation, test, structure = problem.formulation, problem.measurement, end.structure
     distinguishable = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
     pairs = list(_alike(test))
     if not distinguishable or not 0 < len(pairs) <= 15:  # those of six sensors
@@ -363,7 +363,9 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
     kept = test.residual(structure)
-    if least > MENDED * kept or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
+    if least > MENDED * kept or (others and others[0] < _CLEARLY * least):
+        return ()
+    if least > FREE * floor and pressure_of(problem, end)[1].explains:
         return ()
     names = test.sensor_names
     swapped = Finding(

@@ -297,6 +297,15 @@ class Context:
 Check = Callable[[Context], Iterator[Finding]]
 
 
+def run(context: Context, checks: Iterable[Check]) -> list[Finding]:
+    """Run checks one after the other; what they found is added to the context, each finding once."""
+    for check in checks:
+        for one in check(context):
+            if one not in context.found:
+                context.found.append(one)
+    return context.found
+
+
 def of_tests(found: Sequence[Iterable[Finding]]) -> Iterator[Finding]:
     """Findings of each test, with its number where there are several."""
     for i, of_one in enumerate(found, start=1):
