@@ -244,8 +244,8 @@ class Context:
     @property
     def is_judged(self) -> bool:
         """True where a search ended by itself; what was stopped on its way has misfits of another kind."""
-        by_itself = self.end.success or (self.problem.free_modes and not self.cut_short)
-        return by_itself and self.end.stopped is None
+        end = self.end
+        return end.stopped is None and (end.success or (self.problem.free_modes and not self.cut_short))
 
     @cached_property
     def named(self) -> tuple[Finding, ...]:
