@@ -200,10 +200,7 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
 def changing(problem: Prepared, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
     """The mode whose frequency changes most between stretches of all records; none where none does.
 
-    Parameters
-    ----------
-    problem : Prepared
-        Tests that were never fitted are looked at too, where the levels of all are known.
+    Tests that were never fitted are looked at too, where the levels of all are known.
     """
     found = changes(problem)
     if not found:

@@ -40,7 +40,7 @@ def _no_end(kind: Kind, message: str) -> Finding:
 
 def untried_modes(context: Context) -> Iterator[Finding]:
     """The fit of whole records was stopped before all modes were tried."""
-    yield from of_tests([[_untried(modal.omega.size)] * modal.stopped for modal in context.problem.modal])
+    yield from of_tests([[_untried(modal.omega.size)] * bool(modal.stopped) for modal in context.problem.modal])
 
 
 def _untried(modes: int) -> Finding:
