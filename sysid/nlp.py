@@ -84,6 +84,11 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
+def product(one: ca.MX, other: ca.MX) -> ca.MX:
+    """A dense product by BLAS, not by CasADi's own loops."""
+    return ca.mtimes(one, other, "classic")
+
+
 class NumpyFunction(ca.Callback):
     """A function of one column that NumPy computes, as CasADi calls it.
 

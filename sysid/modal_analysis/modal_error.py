@@ -37,6 +37,8 @@ class ModalError:
 
     Attributes
     ----------
+    value : casadi.Function
+        Coordinates to the squared error.
     gradient : casadi.Function
         Coordinates to the squared error and its gradient.
     hessian : casadi.Function
@@ -60,8 +62,12 @@ class ModalError:
         self.shapes = (m, c), (d * with_base, c), (d, m), (1, m), (1, m)  # each by columns, so that rows are entries
         self.ends = np.cumsum([rows * across for rows, across in self.shapes])
         size = int(self.ends[-1])
+        self.value = NumpyFunction(size, [(1, 1)], lambda y: [self._value(self._at(y)[3])])
         self.gradient = NumpyFunction(size, [(1, 1), (size, 1)], self._gradient)
         self.hessian = NumpyFunction(size, [(size, size)], self._hessian)
+
+    def _value(self, pull: ComplexArray) -> float:
+        return float(np.sum(np.abs(pull) ** 2 / self.channel[:, None] ** 2)) / 4
 
     def _at(self, y: Array) -> tuple[Array, tuple[Array, Array, Array], ComplexArray, ComplexArray]:
         """A, the modes (omega, ratios, Gamma), motions above their slopes, and the derivative by what is recorded."""
@@ -84,8 +90,7 @@ class ModalError:
         order = by_columns(m, d)
         by_factors = dots(self._rows(motions, m), pull)  # by columns of A and B
         by_motion = np.sum(dots(motions[m:], pull) * A.T[mode_of_slopes(m, d)], axis=1)
-        value = float(np.sum(np.abs(pull) ** 2 / self.channel[:, None] ** 2)) / 4
-        return value, np.concatenate([by_factors.ravel(), by_motion[order]])
+        return self._value(pull), np.concatenate([by_factors.ravel(), by_motion[order]])
 
     def _hessian(self, y: Array) -> tuple[Array]:
         A, modes, motions, pull = self._at(y)

@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, product, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
 from sysid.search.modal_scaling import stated_totals
@@ -114,8 +114,10 @@ class InverseFactorError:
     ----------
     sizes : tuple of int
         How many coordinates there are of R, P, N, S, and log w with log zeta.
+    value : casadi.Function
+        Coordinates and Psi_0 (n, n) to the squared error.
     gradient : casadi.Function
-        Coordinates and Psi_0 (n, n) to the squared error and its gradient.
+        Coordinates and Psi_0 to the squared error and its gradient.
     hessian : casadi.Function
         Coordinates and Psi_0 to the Hessian.
     modes : casadi.Function
@@ -135,26 +137,28 @@ class InverseFactorError:
         R, P, N = _matrices(factors, n, d)
         psi = psi_0 @ cayley(skew_symmetric(skew, n))
         phi, gamma, rigid = R.T @ psi, psi.T @ P, P.T @ P + N @ N.T
-        value, gradient, hessian = ca.MX(0), ca.MX(y.numel(), 1), ca.MX(y.numel(), y.numel())
+        alone, value, gradient, hessian = ca.MX(0), ca.MX(0), ca.MX(y.numel(), 1), ca.MX(y.numel(), y.numel())
         self._errors = list(_errors_of(test, n))  # which must live as long as the functions made of them
         for error, of_force in self._errors:
             moved = ca.veccat(*((gamma.T, rigid) if of_force else (phi,)), gamma)
             at = ca.vertcat(moved, pole)
             squared, slope = error.gradient(at)
             # What holds no lines is differentiated as it stands.
-            chain = ca.diagcat(ca.densify(ca.jacobian(moved, shapes)), ca.DM.eye(2 * n))
+            chain = ca.densify(ca.diagcat(ca.jacobian(moved, shapes), ca.DM.eye(2 * n)))
             pull = ca.MX.sym("pull", moved.numel())
             bend = ca.Function("bend", [shapes, psi_0, pull], [ca.hessian(ca.dot(pull, moved), shapes)[0]])
+            alone += error.value(at)
             value += squared
             gradient += chain.T @ slope
             bent = bend(shapes, psi_0, slope[: moved.numel()])
-            hessian += chain.T @ error.hessian(at) @ chain + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
+            hessian += product(product(chain.T, error.hessian(at)), chain) + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
         parts, given = [*factors, skew, pole], ca.vertsplit(y, np.cumsum([0, *self.sizes]).tolist())
 
         def function(name: str, *outputs: ca.MX) -> ca.Function:
             inner = ca.Function(name, [*parts, psi_0], list(outputs))
             return ca.Function(name, [y, psi_0], inner.call([*given, psi_0]))
 
+        self.value = function("value", alone)  # a search along a line needs no slopes
         self.gradient, self.hessian = function("gradient", value, gradient), function("hessian", hessian)
         self.modes = function("modes", phi, gamma, rigid)
         self.totals = _totals(problem, self.sizes[:3])
@@ -214,7 +218,7 @@ def _fit_about(problem: Prepared, x: Array, error: InverseFactorError, monitor: 
     skew = z.variable("rotation of modes", np.zeros(n * (n - 1) // 2))
     omega, ratios = spectrum_near(problem, structure, modes_of(structure), z)
     y = ca.vertcat(inverse, loads, base, skew, ca.log(omega), ca.log(ratios))
-    objective, derivatives = error.gradient(y, start.psi)[0], _derivatives(z, y, error, start.psi)
+    objective, derivatives = error.value(y, start.psi), _derivatives(z, y, error, start.psi)
     best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
     rows = error.totals(inverse, loads, base)
     if rows.numel() and monitor.stopped is None:

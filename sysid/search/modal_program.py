@@ -27,7 +27,7 @@ from sysid.modal_analysis.modal_estimate import (
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction, product
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -136,10 +136,10 @@ class ModalResidual:
         scale = ca.sqrt(ca.sum2(self.q**2))
         scaled = self.q / ca.repmat(scale, 1, self.q.size2())
         # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
-        normal = _times(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
-        shapes = ca.solve(normal, _times(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
+        normal = product(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
+        shapes = ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
         self.shapes = shapes.T  # of weighted sensors
-        self.left = ca.DM(target) - _times(self.shapes, self.q)
+        self.left = ca.DM(target) - product(self.shapes, self.q)
         self.phi = ca.diag(ca.DM(1 / weights.sensors)) @ self.shapes
         self.value = ca.sumsqr(self.left)
         self.force_left: ca.MX | None = None
@@ -156,7 +156,7 @@ class ModalResidual:
 
         The best shapes leave no slope by themselves, so that they count as constants.
         """
-        pull = ca.vec(-2 * _times(self.shapes.T, self.left))
+        pull = ca.vec(-2 * product(self.shapes.T, self.left))
         slope = ca.jtimes(ca.vec(self.q), z, pull, True)
         if self.force_left is not None:
             slope += ca.gradient(ca.sumsqr(self.force_left), z)
@@ -231,11 +231,6 @@ class EstimateResidual:
         off = theta_of(scaled, rigid, index) - theta_of(modal.modes, modal.rigid, index)
         risen = float(np.linalg.norm(factor_of(modal) @ off)) / self.size
         return risen, float(np.hypot(risen, residual_of(modal, modal.modes))), residual_of(modal, modes)
-
-
-def _times(one: ca.MX, other: ca.MX) -> ca.MX:
-    """A dense product by BLAS."""
-    return ca.mtimes(one, other, "classic")
 
 
 def hessian_of(model: SpectraModel) -> NumpyFunction:

@@ -63,3 +63,12 @@ def test_lines_that_are_not_met_and_crashes_count(package, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "lines: 3; not met: 2" in printed.out
     assert "RuntimeError: broken" in printed.err
+
+
+def test_a_crash_beside_others_counts_too(package, capsys):
+    _, registry = package
+    measure = importlib.import_module("benchmarks.measure")
+    missing = registry.Benchmark("no_module", "nothing", "-", "-")
+    alone = registry.Benchmark("no_module", "nothing", "-", "-", timed=True)
+    assert len(measure.run([alone, missing], reduced=True, processes=2)) == 2
+    assert "lines: 2; not met: 2" in capsys.readouterr().out

@@ -36,6 +36,7 @@ def drawn(with_base):
 def test_the_error_is_the_sum_over_runs_channels_and_lines(with_base):
     error, y, total = drawn(with_base)
     assert float(error.gradient(y)[0]) == pytest.approx(total, rel=1e-13)
+    assert float(error.value(y)) == pytest.approx(total, rel=1e-13)
 
 
 @pytest.mark.parametrize("with_base", [False, True])
