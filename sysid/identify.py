@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks import check_records, mistakes_of_poor_fit
+from sysid.assessment.checks.against_records import exchanged_sensors
+from sysid.assessment.checks.mistakes import check_records
 from sysid.assessment.checks.model_error import changing
 from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
 from sysid.finding import Finding
@@ -20,8 +21,7 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
-from sysid.results.judgement import judge
-from sysid.results.stated_masses import with_stated_masses
+from sysid.results.judgement import judge, with_stated_masses
 from sysid.search.auto import InTurn, check_local_phase, check_strategy, choose, robust_fit
 from sysid.search.session import DeferredInterrupt, Journal, Progress, Session, limits_of, listeners_of, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
@@ -103,7 +103,7 @@ def identify(
             chosen, why = choose(strategy, prepared, start)
             check_local_phase(prepared, chosen)
             follow = strategy == "auto" and not named
-            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow)
+            in_turn = InTurn(prepared.screened, session, start, exchanged_sensors, follow)
             outcome, why = in_turn.run(chosen, why)
             outcome = robust_fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)

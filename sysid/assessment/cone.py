@@ -56,18 +56,8 @@ class Affine(NamedTuple):
 class Region(NamedTuple):
     """The part of the cone that something limits: unknowns ``start + z @ open`` in coordinates of order one.
 
-    Attributes
-    ----------
-    width : int
-        Order of the limited block t of T.
-    pairs : list of (int, int)
-        Entries of t that are unknowns.
-    start : (m,)
-        The unknowns of T = I.
-    open : (k, m)
-        Directions that no equation fixes.
-    signs, limits : list of Affine
-        That T >= 0, and the bounds from above.
+    The limited block t of T has order `width` and the unknown entries `pairs`; `start` (m,) is T = I, `open` (k, m)
+    are directions that no equation fixes; `signs` tell that T >= 0, `limits` the bounds from above.
     """
 
     width: int

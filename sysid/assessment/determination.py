@@ -46,15 +46,10 @@ BY_RANK = "judged by the rank of the Jacobian, to first order about this answer"
 
 @dataclass(frozen=True)
 class Determination:
-    """Sentences on what data and stated model fix of M_SS, K_SS and C, and what they leave open.
+    """Findings on what data and stated model fix of M_SS, K_SS and C, and what they leave open.
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        What is left open ("open", and "other answers" that were found), and what fixes them, or the modal masses where
-        these alone are fixed ("fixed").
-    judged_by : str
-        `BY_CONE` or `BY_RANK`.
+    Of kind "open" and "other answers", and "fixed" of what fixes them, or the modal masses where these alone are
+    fixed; `judged_by` is `BY_CONE` or `BY_RANK`.
     """
 
     findings: tuple[Finding, ...]
@@ -78,13 +73,10 @@ class Determination:
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated.
+    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated, (2, n, n).
 
-    Attributes
-    ----------
-    mass, stiffness : (2, n, n)
-        kg and N/m (kg m, kg m² and N, N m where a rotation is involved): lower ends, then upper ends.
-        Infinite where there is none.
+    Lower ends, then upper ends, kg and N/m (kg m, kg m² and N, N m where a rotation is involved); infinite where there
+    is none.
     """
 
     mass: Array

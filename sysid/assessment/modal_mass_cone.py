@@ -60,7 +60,8 @@ def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str,
     misfit = test.residual(structure)
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
-    responses = _responses(problem.modal[0], structure)
+    relative = test.relative, test.predict(structure), test.response_std
+    responses = _record(problem.modal[0], *relative, _CLEAR)
     seen = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
     open_ = list(map(left_open, seen))
     if free:
@@ -173,18 +174,9 @@ def _entries(cone: Cone, rows: Array, at_identity: Array, at_once: int = 100) ->
 class _Known(NamedTuple):
     """Statements that hold linear functions of T equal to what they are for T = I.
 
-    Attributes
-    ----------
-    clusters : list of list of int
-        Modes that the misfit cannot tell apart.
-    weighed : list of (n, w)
-        Directions W of a cluster that the base force weighs: ``W' T W`` is known.
-    equations : (e, m)
-        Rows of linear equations in the unknowns, scaled to order one, that the stated models add.
-    signs : (p, m) or None
-        Masses or springs that the models leave, as functions of the unknowns.
-    sentence : str
-        Which models those are.
+    `clusters` are modes that the misfit cannot tell apart, `weighed` the directions W (n, w) of a cluster that the
+    base force weighs: ``W' T W`` is known. `equations` (e, m), scaled to order one, are what the stated models of
+    `sentence` add; `signs` (p, m) are masses or springs that these leave, as functions of the unknowns.
     """
 
     clusters: list[list[int]]
@@ -277,15 +269,8 @@ def _weighed(modal: ModalEstimate, structure: Structure, clusters: list[list[int
 class _Record(NamedTuple):
     """A record beside what a structure leaves of it, all channels in units of their noise.
 
-    Attributes
-    ----------
-    weight : (channels, 1), or (runs, channels, n_freq) where the noise of each line is known
-    size : float
-        Norm of the weighted record.
-    misfit : float
-        Relative.
-    level : float
-        Part of the record that a mode must exceed to be known.
+    `weight` is (channels, 1), or (runs, channels, n_freq) where the noise of each line is known; `size` the norm of
+    the weighted record; `misfit` relative; a mode must exceed the part `level` of the record to be known.
     """
 
     weight: Array
@@ -308,12 +293,16 @@ def _like_rigid(test: Measurement, structure: Structure, k: int) -> str:
     )
 
 
-def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float) -> _Record:
+def _record(
+    modal: ModalEstimate, record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float
+) -> _Record:
     """Weigh a record; `times` the misfit is what may look like a mode where its origin is unknown.
 
     Where the misfit is no more than the stated noise, all lines together tell an amplitude, and `_RESOLVED` of
     its standard deviations will do.
     """
+    if modal.by_modes and std is not None:
+        return _record_a_line(record, predicted, std)
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise = rms(record - predicted) if std is None else rms(std)
     sizes = rms(record)
@@ -337,22 +326,12 @@ def _record_a_line(record: ComplexArray, predicted: ComplexArray, std: Array) ->
     return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
 
 
-def _responses(modal: ModalEstimate, structure: Structure) -> _Record:
-    """The relative accelerations."""
-    test = modal.records
-    if modal.by_modes and test.response_std is not None:
-        return _record_a_line(test.relative, test.predict(structure), test.response_std)
-    return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
-
-
 def _forces(modal: ModalEstimate, structure: Structure) -> _Record | None:
     """The base force, where it was measured."""
     test = modal.records
     if test.force is None:
         return None
-    if modal.by_modes and test.force_std is not None:
-        return _record_a_line(test.force, test.predict_force(structure), test.force_std)
-    return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
+    return _record(modal, test.force, test.predict_force(structure), test.force_std, 1.0)
 
 
 def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: Array, record: _Record) -> Array:

@@ -38,7 +38,7 @@ from sysid.assessment.sensitivity import (
     with_totals,
 )  # fmt: skip
 from sysid.assessment.statements import conditioned
-from sysid.errors import InputError
+from sysid.errors import refuse
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
@@ -149,10 +149,11 @@ class Uncertainty:
         """
         from scipy.special import ndtri
 
-        if name not in (*_QUANTITIES, *self.variables):
-            raise InputError(f"no uncertainty of {name!r}; give one of {', '.join((*_QUANTITIES, *self.variables))}")
-        if not 0 < level < 1:
-            raise InputError(f"level = {level}: a probability between 0 and 1 is needed")
+        known = (*_QUANTITIES, *self.variables)
+        refuse(
+            (name not in known, f"no uncertainty of {name!r}; give one of {', '.join(known)}"),
+            (not 0 < level < 1, f"level = {level}: a probability between 0 and 1 is needed"),
+        )
         z = float(ndtri((1 + level) / 2))
         if name in self.variables:
             value, std = self.values[name], self.variables[name]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,14 +12,13 @@ import numpy as np
 
 from sysid.compare import peers
 from sysid.compare.peers import MATRICES, MethodResult, Recorder, Status, errors_of, status_of
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, refuse
 from sysid.identify import identify, prepare
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.facts import seconds_in_words
-from sysid.results.identification import Identification
-from sysid.results.summary import WIDTH
+from sysid.results.summary import folded
 from sysid.results.tables import in_columns
 from sysid.search.auto import NAMED
 from sysid.search.session import DeferredInterrupt, Session
@@ -110,8 +108,8 @@ def compare(
     InputError
         Where no strategy applies, with the reason of each, or the problem cannot be searched.
     """
-    if problem.loss != "squares":
-        raise InputError(f"compare minimises squares, and the problem has loss={problem.loss!r}: leave it out")
+    loss = f"compare minimises squares, and the problem has loss={problem.loss!r}: leave it out"
+    refuse((problem.loss != "squares", loss))
     results: list[MethodResult] = []
     try:
         for result in _results(problem, rng, max_time):
@@ -132,8 +130,8 @@ def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[Met
         prepare(prepared, session)
         strategies = {name: make() for name, make in NAMED.items()}
         refusals = {name: strategy.refusal(prepared, None) for name, strategy in strategies.items()}
-        if all(refusals.values()):
-            raise InputError(f"no strategy applies: {'; '.join(f'{name}: {why}' for name, why in refusals.items())}")
+        reasons = "; ".join(f"{name}: {why}" for name, why in refusals.items())
+        refuse((all(refusals.values()), f"no strategy applies: {reasons}"))
         landscape = None if refusals[Swarm.name] else peers.Landscape.of(prepared, session)
         interrupt.check()
     most = 0
@@ -166,25 +164,20 @@ def _strategy(
         return MethodResult(strategy.name, Status.REFUSED, str(error))
     except (InputError, SolverError) as error:
         return MethodResult(strategy.name, Status.FAILED, str(error))
-    return _strategy_row(strategy.name, result, recorder)
-
-
-def _strategy_row(name: str, result: Identification, recorder: Recorder) -> MethodResult:
-    """The row of an identification."""
     history = result.history
     before = [value for value in (history.swarm, history.start) if np.isfinite(value)]
     return MethodResult(
-        name,
+        strategy.name,
         status_of(result.success, result.interrupted),
         result.message,
         before[0] if before else np.nan,
         result.objective,
         result.residual,
-        errors_of(result.structure, result.problem.reference),
+        errors_of(result.structure, problem.reference),
         history.evaluations,
         history.wall_time,
         recorder.phases,
-        any(name == "continuation" for name, _ in recorder.phases),
+        any(phase == "continuation" for phase, _ in recorder.phases),
     )
 
 
@@ -195,8 +188,9 @@ def comparison_text(comparison: Comparison) -> str:
         ("method", [result.name for result in results]),
         ("before", [_number(result.before, ".2e") for result in results]),
         ("after", [_number(result.after, ".2e") for result in results]),
-        *_residual(comparison),
-        *_errors(comparison),
+        *[("residual", [_number(result.residual, ".2e") for result in results])] * (comparison.quantity != "residual"),
+        *[(f"{name}, %", [_number(result.errors[i], ".2g") for result in results]) for i, name in enumerate(MATRICES)]
+        * (comparison.problem.reference is not None),
         ("evaluations", [_number(result.evaluations or np.nan, ",.0f") for result in results]),
         ("seconds", [_number(result.seconds, ".2f") for result in results]),
         ("status", [result.status.value for result in results]),
@@ -223,19 +217,6 @@ def as_csv(comparison: Comparison) -> str:
     return out.getvalue()
 
 
-def _residual(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
-    """The residual in a column of its own, where another quantity is minimised."""
-    if comparison.quantity != "residual":
-        yield "residual", [_number(result.residual, ".2e") for result in comparison.results]
-
-
-def _errors(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
-    """Columns of the errors, where there is a reference."""
-    if comparison.problem.reference is not None:
-        for i, name in enumerate(MATRICES):
-            yield f"{name}, %", [_number(result.errors[i], ".2g") for result in comparison.results]
-
-
 def _notes(comparison: Comparison) -> Iterator[str]:
     """Meaning of the columns, and the words of the methods that are no fit."""
     what = {
@@ -246,15 +227,10 @@ def _notes(comparison: Comparison) -> Iterator[str]:
     if truth is not None:
         undamped = ", which has no damping, so that C has no relative error" * (not np.any(truth.damping))
         errors = f"; M, K, C: error against the reference{undamped}"
-    yield from _folded(f"before, after: {what} before and after the local phase{errors}", "")
+    yield folded(f"before, after: {what} before and after the local phase{errors}")
     for result in comparison.results:
         if result.status is not Status.FIT:
-            yield from _folded(f"{result.name}: {' '.join(result.message.split())}", "  - ")
-
-
-def _folded(words: str, mark: str) -> list[str]:
-    indent = " " * (len(mark) or 2)
-    return textwrap.wrap(words, WIDTH, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
+            yield folded(f"  - {result.name}: {' '.join(result.message.split())}")
 
 
 def _number(value: float, form: str) -> str:

@@ -128,13 +128,11 @@ def status_of(success: bool, interrupted: bool) -> Status:
 
 def errors_of(structure: Structure, reference: Structure | None) -> tuple[float, ...]:
     """Errors of M_SS, K_SS and C in %: see `MethodResult.errors`."""
-    if reference is None or not _alike(structure.recovery, reference.recovery):
+    if reference is None or structure.recovery.shape != reference.recovery.shape:
+        return MethodResult.errors
+    if not np.allclose(structure.recovery, reference.recovery):
         return MethodResult.errors
     return tuple(100 * error for error in matrix_errors(structure, reference))
-
-
-def _alike(recovery: Array, other: Array) -> bool:
-    return recovery.shape == other.shape and np.allclose(recovery, other)
 
 
 class Spent(Exception):  # noqa: N818 - not an error

@@ -144,7 +144,11 @@ def opening(it: Identification, level: NoiseLevel) -> str:
     against = bullets(sentence(str(one)) for one in it.contradictions[:FIRST])
     judged = f"{paragraph(sentence(verdict(it)))}{against}<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
-    rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
+    unknowns = unknown_rows(it)
+    few = [(f"mass at {one.name}", one.mass, one.std, "kg") for one in deck_masses(it)]
+    few += [(row.label, row.value, row.std, row.unit) for row in unknowns] * (len(unknowns) <= _MOST_UNKNOWNS)
+    figures = ((name, _with_interval(it, value, std, unit).strip()) for name, value, std, unit in few)
+    rows = [*_masses(it), *figures, *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
 
@@ -164,9 +168,7 @@ def trust(it: Identification) -> str:
 
 def _subject(it: Identification) -> str:
     test, n, d = it.measurement, it.structure.n, it.structure.n_base
-    of = f"{n} degrees of freedom"
-    if n != test.n_sensors:
-        of += f" from {test.n_sensors} sensors"
+    of = f"{n} degrees of freedom" + f" from {test.n_sensors} sensors" * (n != test.n_sensors)
     records = "whole records, their transients taken off, " * it.records.measurement.is_whole
     words = (
         f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
@@ -205,19 +207,6 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
         exact = known and half_width(deviation, mass) in ("open", "0")
         words = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
         yield f"{what}, {axis}", words
-
-
-def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
-    """Masses of a lumped model, sensor by sensor."""
-    for one in deck_masses(it):
-        yield f"mass at {one.name}", _with_interval(it, one.mass, one.std, "kg")
-
-
-def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
-    """Unknowns with a meaning of their own, where they are few."""
-    rows = unknown_rows(it)
-    for row in rows if len(rows) <= _MOST_UNKNOWNS else ():
-        yield row.label, _with_interval(it, row.value, row.std, row.unit).strip()
 
 
 def _modes(it: Identification) -> Iterator[tuple[str, str]]:

@@ -40,25 +40,11 @@ from sysid.report.opening import (
     trust,
     width_text,
 )
+from sysid.results import tables
 from sysid.results.facts import COLUMNS, seconds_in_words
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import JUDGEMENTS, residual_in_words
-from sysid.results.tables import (
-    NOISE_COLUMNS,
-    counted,
-    gains_of_sensors,
-    half_width,
-    is_one_of_many,
-    known_half_width,
-    mass_percent_std,
-    missing_mass,
-    noise_of_channels,
-    noise_source,
-    stated_values,
-    tilde,
-    unknown_rows,
-)  # fmt: skip
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF
@@ -172,21 +158,21 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), width_text(half_width(row.std, row.value)), row.unit, number(row.lower),
-            number(row.upper), row.on_bound,
+            row.label, number(row.value, 6), width_text(tables.half_width(row.std, row.value)), row.unit,
+            number(row.lower), number(row.upper), row.on_bound,
         )
-        for row in unknown_rows(it)
+        for row in tables.unknown_rows(it)
     ]  # fmt: skip
     if not rows:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
-    values = bullets(sentence(s) for s in stated_values(it))
+    values = bullets(sentence(s) for s in tables.stated_values(it))
     return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + values
 
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.records.reference, it.quick_uncertainty
-    many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * it.identified_ratios
+    many, frequencies, percent = tables.is_one_of_many(it), structure.natural_frequencies, 100 * it.identified_ratios
     widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
     rounded_frequencies = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
     damping = [rounded(ratio, std) for ratio, std in zip(percent, widths[1], strict=True)]
@@ -213,7 +199,7 @@ def _modes(it: Identification) -> str:
             columns.append(["difference [%]", *map(_difference, ours, theirs), ""])
     if many.any():
         notes.append("~: one of many values that fit as well.")
-    notes += map(sentence, missing_mass(it))
+    notes += map(sentence, tables.missing_mass(it))
     head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
 
@@ -232,11 +218,13 @@ def _shapes(it: Identification) -> str:
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:
     """Effective masses of all modes and their sum, a column a base direction."""
-    share, std = it.structure.effective_mass_percent, mass_percent_std(it)
+    share, std = it.structure.effective_mass_percent, tables.mass_percent_std(it)
     for i, axis in enumerate(it.measurement.base_axes or ()):
-        below = [tuple(filter(None, (known_half_width(value, 100.0, "±"),))) for value in std[:, i]]
-        cells = [Cell(f"{tilde(one)}{v:.2f}", b) for v, one, b in zip(share[:, i], many[:, i], below, strict=True)]
-        yield [f"effective mass {axis} [%]", *cells, f"{tilde(many[:, i])}{share[:, i].sum():.2f}"]
+        below = [tuple(filter(None, (tables.known_half_width(value, 100.0, "±"),))) for value in std[:, i]]
+        cells = [
+            Cell(f"{tables.tilde(one)}{v:.2f}", b) for v, one, b in zip(share[:, i], many[:, i], below, strict=True)
+        ]
+        yield [f"effective mass {axis} [%]", *cells, f"{tables.tilde(many[:, i])}{share[:, i].sum():.2f}"]
 
 
 def _rigid_body_mass(it: Identification) -> str:
@@ -287,26 +275,26 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
 
 def _noise(it: Identification) -> str:
     """The noise of each channel of whole records."""
-    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
-    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time, of noise up to half "
-    caption += (
-        "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
+    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in tables.noise_of_channels(it)]
+    caption = (
+        f"Noise of each channel, {tables.noise_source(it)}: standard deviation of a sample in time, of noise up to "
+        "half the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
     )
-    return table(("channel", *NOISE_COLUMNS), rows, caption) if rows else ""
+    return table(("channel", *tables.NOISE_COLUMNS), rows, caption)
 
 
 def _gains(it: Identification) -> str:
     """The gain of each sensor as the records show it."""
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
-    head, found = ["sensor", "gain", "±"], gains_of_sensors(it)
-    rows = [[g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain)] for g in found]
-    if it.determined and any(np.isfinite(g.worth) for g in found):  # else M_SS has no deviation
-        head.append("1 % moves M_SS by, deviations")
-        caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
-        for row, gain in zip(rows, found, strict=True):
-            row.append(number(gain.worth, 2))
-    return table(head, rows, caption) if rows else ""
+    found = tables.gains_of_sensors(it)
+    priced = it.determined and any(np.isfinite(g.worth) for g in found)  # else M_SS has no deviation
+    caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
+    head = ("sensor", "gain", "±", *["1 % moves M_SS by, deviations"] * priced)
+    rows = [
+        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), *[number(g.worth, 2)] * priced) for g in found
+    ]
+    return table(head, rows, caption)
 
 
 def _outliers(it: Identification) -> str:
@@ -391,7 +379,7 @@ def _convergence(it: Identification) -> str:
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
     ran = it.phases
     swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
-    note = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
+    note = swarm * bool(history.swarm_curve.size) + f"{tables.counted(steps, 'local iteration')}, exact gradients"
     if it.records.reference is not None:
         note += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
     alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
@@ -403,7 +391,9 @@ def _convergence(it: Identification) -> str:
     rows = [[row[k] for k in columns] for row in ran]
     parts.append(table([COLUMNS[k] for k in columns], rows, f"{note}.", words=True))
     if history.restarts:
-        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
+        again = (
+            f"{tables.counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
+        )
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
     if history.refinement_in_words:
         parts.append(paragraph(f"{history.refinement_in_words}.", "soft"))
@@ -437,7 +427,7 @@ def _effective_masses(it: Identification) -> str:
     words, reference = "Bars: each mode; lines: their running sum", it.records.reference
     words += "; short dashes: each mode of the reference" * (reference is not None and reference.n == it.structure.n)
     words += ". What is missing to 100 % moves with the base, or in modes beyond the lines."
-    label, caption = (ONE_OF_MANY, CHOSEN) if is_one_of_many(it).any() else ("", "")
+    label, caption = (ONE_OF_MANY, CHOSEN) if tables.is_one_of_many(it).any() else ("", "")
     alt = "effective masses by mode and base direction"
     return paragraph(words, "soft") + picture(plot.effective_masses(it), alt, caption, label=label)
 

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, path_of, text
+from sysid.errors import InputError, path_of, refuse, text
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
@@ -57,9 +57,8 @@ class RunRequest:
 
     def __str__(self) -> str:
         recipe = self.recipe
-        noise = f", rng {recipe.rng}" if recipe.rng else ""
-        data = "" if recipe.data is None else f", data {recipe.data}"
-        refined = "" if self.refine_by is None else f" refined by {self.refine_by}"
+        noise, data = f", rng {recipe.rng}" * bool(recipe.rng), f", data {recipe.data}" * (recipe.data is not None)
+        refined = f" refined by {self.refine_by}" * (self.refine_by is not None)
         return f"{recipe.title}{noise}{data}, strategy {self.strategy}{refined}, seed {self.seed}"
 
     def to_tree(self) -> Tree:
@@ -123,8 +122,8 @@ class Checkpoint:
             raise InputError(f"{self.path} cannot be read: {error.strerror or error}") from error
         except InputError as error:
             raise InputError(f"{self.path} cannot be read: {error}") from error
-        if tree.get("content") != _CONTENT or number != _FORMAT:
-            raise InputError(f"{self.path} is not the state of an unfinished search of this sysid")
+        ours = tree.get("content") == _CONTENT and number == _FORMAT
+        refuse((not ours, f"{self.path} is not the state of an unfinished search of this sysid"))
         return tree
 
     def _entries(self, tree: Tree) -> Tree:
@@ -159,11 +158,9 @@ class Checkpoint:
         entries: Tree = {}
         if self.exists:
             tree = self.read()
-            if tree.get("search") != search:
-                raise InputError(
-                    f"{self.path} is of another search: the problem, its records, the strategy, the seed or sysid has "
-                    "changed since; take it away, or give another file"
-                )
+            changed = "the problem, its records, the strategy, the seed or sysid has changed since"
+            remedy = "take it away, or give another file"
+            refuse((tree.get("search") != search, f"{self.path} is of another search: {changed}; {remedy}"))
             entries = self._entries(tree)
         request = None if self.request is None else self.request.to_tree()
 

@@ -130,9 +130,9 @@ def _reported_unknowns(formulation: Formulation) -> Iterator[tuple[Unknown, bool
     Those of models with a form of their own, and variables, fixed too. The entries of a free matrix's factor are none,
     nor are shares of which only the ratios count.
     """
-    shown = (not formulation.mass.free, not formulation.stiffness.free, True)
+    of_a_form = (not formulation.mass.free, not formulation.stiffness.free, True)
     ratios = (False, False, formulation.damping.free)
-    for group, among, are_ratios in zip(formulation.of_models, shown, ratios, strict=True):
+    for group, among, are_ratios in zip(formulation.of_models, of_a_form, ratios, strict=True):
         yield from ((one, are_ratios) for one in group if among and not one.relative)
     yield from ((one, False) for one in formulation.variables)
 

@@ -6,14 +6,14 @@ import ast
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, finite_array, instance, shown, text, whole_number
+from sysid.errors import InputError, finite_array, instance, refuse, shown, text, whole_number
 from sysid.files.tree import to_bytes
 from sysid.finding import Finding
 from sysid.problem.prepared import Prepared
@@ -71,17 +71,17 @@ class Recipe:
         object.__setattr__(self, "rng", whole_number("Recipe: rng", self.rng, at_least=0))
         if self.data is not None:
             text("Recipe: data", self.data)
-        if not isinstance(self.parameters, Mapping) or not all(isinstance(name, str) for name in self.parameters):
-            raise InputError("Recipe: parameters is a dictionary from names to values: parameters={'floors': 3}")
+        named = isinstance(self.parameters, Mapping) and all(isinstance(name, str) for name in self.parameters)
+        refuse((not named, "Recipe: parameters is a dictionary from names to values: parameters={'floors': 3}"))
         object.__setattr__(self, "parameters", dict(self.parameters))
         object.__setattr__(self, "_texts", frozenset((name, repr(value)) for name, value in self.parameters.items()))
         if self.start is not None:
             object.__setattr__(self, "start", tuple(finite_array("Recipe: start", self.start).ravel().tolist()))
         for name, value in self.parameters.items():
-            if name in ("data", "rng"):
-                raise InputError(f"parameter {name!r} is a field of the recipe itself")
-            if not _is_plain(value):
-                raise InputError(f"parameter {name} = {value!r}: give a number, a text, or a list of them")
+            refuse(
+                (name in ("data", "rng"), f"parameter {name!r} is a field of the recipe itself"),
+                (not _is_plain(value), f"parameter {name} = {value!r}: give a number, a text, or a list of them"),
+            )
 
     @property
     def title(self) -> str:
@@ -293,12 +293,7 @@ class Identification(Answer):
         prepared = Prepared.from_tree(problem, self._tree_for(problem))
         if self.x is not None:
             _check_unknowns(self, self.x, prepared)
-        kept = {
-            field.name: getattr(self, field.name)
-            for field in fields(self)
-            if field.init and field.name not in ("problem", "prepared")
-        }
-        return type(self)(**kept, problem=problem, prepared=prepared)
+        return replace(self, problem=problem, prepared=prepared)
 
     def _tree_for(self, problem: Problem) -> dict[str, Any]:
         """What was found of the records, for a problem that may state other things of them: fits of its tests alone."""
@@ -362,11 +357,9 @@ def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> 
     """Refuse a problem of other records."""
     for name in ("freq", "base", "response", "force"):
         ours, other = getattr(records.measurement, name), getattr(problem.measurement, name)
-        if (ours is None) != (other is None) or not np.array_equal(ours, other):
-            raise InputError(
-                f"the problem that was given has other records than the result ({name}): give the problem of the same "
-                "test, with the same data and parameters"
-            )
+        mistake = f"the problem that was given has other records than the result ({name})"
+        remedy = "give the problem of the same test, with the same data and parameters"
+        refuse((not np.array_equal(ours, other), f"{mistake}: {remedy}"))
 
 
 def _check_unknowns(result: Identification, x: Array, problem: Prepared) -> None:
@@ -374,21 +367,14 @@ def _check_unknowns(result: Identification, x: Array, problem: Prepared) -> None
     given = [(unknown.name, unknown.shape) for unknown in problem.variables]
     fixed = {unknown.name for unknown in problem.formulation.fixed}
     its = [(name, np.shape(value)) for name, value in result.values.items() if name not in fixed]
-    if given != its:
-        raise InputError(
-            f"the problem that was given has other unknowns than the result: {_in_words(given)} instead of "
-            f"{_in_words(its)}"
-        )
+    words = f"{_in_words(given)} instead of {_in_words(its)}"
+    refuse((given != its, f"the problem that was given has other unknowns than the result: {words}"))
     structure = problem.structure(x)
     for name in ("mass", "stiffness"):
         one, other = getattr(structure, name), getattr(result.structure, name)
-        if one.shape != other.shape or not np.allclose(
-            one, other, rtol=NEGLIGIBLE, atol=NEGLIGIBLE * np.abs(other).max()
-        ):
-            raise InputError(
-                f"the unknowns of the result stand for another {name} matrix in the problem that was given: it is not "
-                "made as it was for the identification"
-            )
+        close = one.shape == other.shape and np.allclose(one, other, NEGLIGIBLE, NEGLIGIBLE * np.abs(other).max())
+        mistake = f"the unknowns of the result stand for another {name} matrix in the problem that was given"
+        refuse((not close, f"{mistake}: it is not made as it was for the identification"))
 
 
 def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:

@@ -1,4 +1,4 @@
-"""Judgement of where a search ended: what checks find, what is determined, and how far noise leaves it known."""
+"""The judgement of where a search ended, after its fit was adjusted to what is stated of masses."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.checks import OF_THE_END, QUICK, run
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK
+from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.gains import assumed, rests_on
 from sysid.assessment.determination import BY_RANK, determine
+from sysid.assessment.information import Index
 from sysid.assessment.sensitivity import system_matrices
-from sysid.assessment.uncertainty import LARGE
+from sysid.assessment.statements import Adjusted, Statements, adjust, predict_statements, statements_of
+from sysid.assessment.uncertainty import LARGE, moves_by_records
+from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
+from sysid.modal_analysis.modal_estimate import theta_of
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
+from sysid.search.modal import objective_of
+from sysid.search.modal_program import to_stated_totals
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session, TimeIsOver, within
 from sysid.search.strategy import Outcome
-from sysid.structure.thresholds import EXACT
+from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _NOT_JUDGED = Finding(
@@ -46,7 +55,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
     try:
         with within(session.left):
             known = determine(prepared.screened, end.structure, end.x, end.alternatives)
-            run(context)
+            run(context, CHECKS)
         open_ = cautions(known.findings)
         if verdict.success and known.judged_by == BY_RANK and not (open_ or contradicting(context.found)):
             end = with_other_answers(prepared, end, session)
@@ -116,3 +125,159 @@ def _check_precision(it: Identification) -> Iterator[Finding]:
             yield Finding("noise", Severity.CAUTION, sentence, numbers={"largest": largest})
     if not open_ and it.prepared.formulation.fits_records:
         yield from rests_on(it.measurement, it.gains, it.gain_worth)
+
+
+def with_stated_masses(problem: Prepared, end: Outcome, session: Session) -> Outcome:
+    """The fit adjusted to records and statements together, told of statements that contradict the rest."""
+    if end.stopped is not None or statements_of(problem, end.structure) is None:
+        return end
+    try:
+        with within(session.left):
+            return _adjusted(problem, end)
+    except TimeIsOver:
+        late = "the time was over before stated masses were adjusted together with the records"
+        return replace(end, success=False, message=f"{end.message}; {late}")
+
+
+def _adjusted(problem: Prepared, end: Outcome) -> Outcome:
+    first = end.structure
+    stated = statements_of(problem, first)
+    assert stated is not None
+    modes, index, _, normals, *_ = moves_by_records(problem, first)
+    if problem.measurement.response_std is None:
+        least = EXACT / max(problem.measurement.residual(first), np.finfo(float).eps)
+        normals = normals * max(1.0, least)
+    theta = theta_of(modes, first.rigid_body_mass, index)
+    best = adjust(problem, stated, theta, index, normals)
+    said = tuple(_contradictions(problem, stated, best, theta, index, normals))
+    try:
+        structure = _structure(problem, first, theta, best.theta, index)
+    except (InputError, np.linalg.LinAlgError):
+        structure = None
+    if structure is None or not best.holds:
+        unmet = "the stated masses cannot all be met together with the records"
+        said = said or (Finding("stated masses", Severity.CONTRADICTS, unmet),)
+        return replace(end, findings=(*end.findings, *said))
+    x = problem.values(structure)
+    if end.x is not None:
+        at = problem.formulation.parts.damping
+        x[at] = np.clip(x[at], problem.lower[at], problem.upper[at])
+        x[at.stop :] = end.x[at.stop :]
+    history = replace(end.history, local=objective_of(problem, structure, x))
+    return replace(end, structure=structure, x=x, history=history, findings=(*end.findings, *said))
+
+
+def _structure(problem: Prepared, first: Structure, before: Array, after: Array, index: Index) -> Structure:
+    """The structure of adjusted modal parameters; what was repeated in the first stays so."""
+    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(after[:, None]))
+    _, _, omega_before, ratios_before, _ = (part[..., 0] for part in index.split(before[:, None]))
+    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - omega_before)
+    ratios = first.damping_ratios * np.exp(log_ratios - ratios_before)
+    order = np.argsort(omega, kind="stable")
+    end = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
+    geometry, P, G = problem.geometry, np.linalg.inv(end.phi), problem.geometry.rigid_body
+    if problem.measurement.force is None:
+        groups = geometry.directions[: geometry.n]
+        remainder = np.diag(problem.totals)
+        _, left = to_stated_totals(problem, P, end.gamma, G, groups, remainder, scaled=True)
+    else:
+        left = rigid - end.gamma.T @ end.gamma
+        size = np.sqrt(np.diag(rigid))
+        lam, V = np.linalg.eigh(left / np.outer(size, size))
+        left = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
+    M_SS = P.T @ P
+    delta = end.gamma - P @ G
+    return assemble(
+        M_SS, P.T @ end.gamma - M_SS @ G, delta.T @ delta + left, (P.T * end.omega**2) @ P, G, ratios=end.ratios,
+        test=problem.measurement,
+    )  # fmt: skip
+
+
+def _contradictions(
+    problem: Prepared, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
+) -> Iterator[Finding]:
+    """Statements and records that disagree beyond chance, and which statements explain it."""
+    numbers = _numbers(problem, index)
+    chance = _chance(best, numbers)
+    if chance >= FALSE_ALARM:
+        return
+    found = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
+    explained: list[tuple[float, tuple[float, float], str]] = []
+    for row in range(stated.values.size):
+        without = adjust(problem, stated.without(row), theta, index, normals)
+        if without.freedom == best.freedom or _chance(without, numbers) < FALSE_ALARM:
+            continue
+        value = (predict_statements(problem, stated, without.theta, index)[0] * stated.scale)[row]
+        off = np.sqrt(max(best.misfit - without.misfit, 0.0))
+        both = (float(stated.values[row]), float(value))
+        explained.append((off, both, _in_words(problem, stated, row, value, off)))
+    if explained:
+        explained.sort(key=lambda one: -one[0])
+        near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - LIKELY**2]
+        yield Finding(
+            "stated masses", Severity.CONTRADICTS, f"{found}: {listed(near, '; or ')}",
+            numbers={
+                "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
+                "by the records": explained[0][1][1], "statements": float(len(near)),
+            },
+        )  # fmt: skip
+        return
+    factor = _common_factor(problem, stated, theta, index, normals)
+    if factor > 0:
+        scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
+        if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= FALSE_ALARM:
+            yield Finding(
+                "stated masses", Severity.CONTRADICTS, f"{found}; all of them would be met {factor:.4g} times as large",
+                "is a unit or the force's gain wrong?", numbers={"chance": chance, "factor": factor},
+            )  # fmt: skip
+            return
+    unexplained = f"{found}; no single one of them explains it"
+    yield Finding("stated masses", Severity.CONTRADICTS, unexplained, numbers={"chance": chance})
+
+
+def _common_factor(problem: Prepared, stated: Statements, theta: Array, index: Index, normals: Array) -> float:
+    """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
+    if problem.measurement.force is None:
+        return 0.0
+    values, slopes = predict_statements(problem, stated, theta, index)
+    noise = slopes @ normals
+    weight = np.linalg.pinv(noise @ noise.T, hermitian=True)
+    given = stated.values / stated.scale
+    return float(given @ weight @ values / (given @ weight @ given))
+
+
+def _in_words(problem: Prepared, stated: Statements, row: int, value: float, off: float) -> str:
+    test, n = problem.measurement, problem.geometry.n
+    axes = test.base_axes or [f"base direction {i + 1}" for i in range(test.n_base)]
+    given = stated.values[row]
+    factor = f", {value / given:.4g} times as much" if given else ""
+    if row < len(stated.entries):
+        i, j = stated.entries[row]
+        column = test.sensor_names[j] if j < n else f"base {axes[j - n]}"
+        name = f"row {test.sensor_names[i]}, column {column}"
+    else:
+        i, j = stated.totals[row - len(stated.entries)]
+        name = f"the total in {axes[i]}" if i == j else f"the rigid-body mass between {axes[i]} and {axes[j]}"
+    return (
+        f"{name} is stated as {given:.4g}, and the records with all other statements make it {value:.4g}{factor} "
+        f"({off:.2g} deviations off)"
+    )
+
+
+def _numbers(problem: Prepared, index: Index) -> float:
+    """Degrees of freedom of the records' own noise; infinite where it is stated."""
+    test = problem.measurement
+    if test.response_std is not None and (test.force is None or test.force_std is not None):
+        return np.inf
+    return float(max(2 * test.numbers - index.size, 1))
+
+
+def _chance(found: Adjusted, numbers: float) -> float:
+    """Probability of a misfit so large where all statements are right."""
+    from scipy.special import chdtrc, fdtrc
+
+    if found.freedom <= 0:
+        return 1.0
+    if np.isinf(numbers):
+        return float(chdtrc(found.freedom, found.misfit))
+    return float(fdtrc(found.freedom, numbers, found.misfit / found.freedom))

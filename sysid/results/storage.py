@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from sysid.errors import InputError, path_of
+from sysid.errors import InputError, path_of, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.results.version import __version__
 
@@ -63,8 +63,7 @@ def read_tree(path: str | Path, build: Callable[[Tree], T]) -> T:
         there = source.is_file()
     except OSError as error:  # such as a name that is too long
         raise InputError(f"{given} cannot be read: {error.strerror or error}") from None
-    if not there:
-        raise InputError(f"no result at {source}: give the .h5 file that 'sysid run' wrote, or its folder")
+    refuse((not there, f"no result at {source}: give the .h5 file that 'sysid run' wrote, or its folder"))
     try:
         return build(_tree(source))
     except InputError as error:
@@ -78,23 +77,19 @@ def read_tree(path: str | Path, build: Callable[[Tree], T]) -> T:
 def _tree(source: Path) -> Tree:
     """The tree of a file."""
     image = source.read_bytes()
-    if image.startswith(_HDF5):
-        raise InputError(f"it is no result of this sysid, but of one before format 3, or of another program; {_ANEW}")
-    if not is_tree(image):
-        raise InputError("it is not a result of sysid, or its first bytes are damaged")
+    earlier = f"it is no result of this sysid, but of one before format 3, or of another program; {_ANEW}"
+    refuse(
+        (image.startswith(_HDF5), earlier),
+        (not is_tree(image), "it is not a result of sysid, or its first bytes are damaged"),
+    )
     tree, number = from_bytes(image)
-    if number > FORMAT:
-        raise InputError(
-            f"it has format {number} (sysid {tree.get('sysid_version')}), and this one reads format {FORMAT}: a later "
-            "sysid is needed"
-        )
-    if tree["content"] != CONTENT:
-        raise InputError(f"it holds a {tree['content']}, not a {CONTENT}")
-    if number < FORMAT:
-        raise InputError(
-            f"it has format {number}, of an earlier sysid, in which expressions could hold code, and this one reads "
-            f"format {FORMAT}; {_ANEW}"
-        )
+    version, content, this = tree.get("sysid_version"), tree.get("content"), f"this one reads format {FORMAT}"
+    code = "in which expressions could hold code"
+    refuse(
+        (number > FORMAT, f"it has format {number} (sysid {version}), and {this}: a later sysid is needed"),
+        (content != CONTENT, f"it holds a {content}, not a {CONTENT}"),
+        (number < FORMAT, f"it has format {number}, of an earlier sysid, {code}, and {this}; {_ANEW}"),
+    )
     return tree
 
 

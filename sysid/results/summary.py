@@ -10,26 +10,9 @@ import numpy as np
 from sysid.assessment.sensitivity import system_matrices
 from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
+from sysid.results import tables
 from sysid.results.answer import Answer
 from sysid.results.facts import COLUMNS, seconds_in_words
-from sysid.results.tables import (
-    MANY,
-    NOISE_COLUMNS,
-    counted,
-    deck_masses,
-    gains_of_sensors,
-    half_width,
-    in_columns,
-    is_one_of_many,
-    known_half_width,
-    mass_percent_std,
-    missing_mass,
-    noise_of_channels,
-    noise_source,
-    stated_values,
-    tilde,
-    unknown_rows,
-)  # fmt: skip
 from sysid.structure.thresholds import UNEXPLAINED
 
 _SCALE = (
@@ -67,8 +50,8 @@ def summary(it: Answer) -> str:
         "",
         *_unknowns(it),
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}"
-        + f"; {counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
-        *(in_columns([COLUMNS, *it.phases]) if len(it.phases) > 1 else []),
+        + f"; {tables.counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
+        *(tables.in_columns([COLUMNS, *it.phases]) if len(it.phases) > 1 else []),
         *filter(None, [it.history.refinement_in_words]),
         *map(str, (*it.of_kind("strategy"), *it.notes)),
         "rigid-body mass "
@@ -76,7 +59,7 @@ def summary(it: Answer) -> str:
         + " (~ normalised: no mass is stated, no force was measured)" * it.facts.unit_mass,
         *_deck_masses(it),
     ]
-    lines += stated_values(it)
+    lines += tables.stated_values(it)
     further = it.further_tests
     for i, (test, structure) in enumerate(further, start=1):
         frequencies = ", ".join(f"{f:.5g}" for f in structure.natural_frequencies[:8])
@@ -91,26 +74,30 @@ def summary(it: Answer) -> str:
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
         rest += _ranges(it)
     lines += ["besides:"] * bool(rest) + rest
-    lines += [_NOT_COMPUTED] if it.hurried else []
+    lines += [_NOT_COMPUTED] * it.hurried
     lines.append(f"search: {it.message}")
-    return "\n".join(_folded(line) for line in lines)
+    return "\n".join(folded(line) for line in lines)
 
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
-    head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
-    return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
+    rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in tables.noise_of_channels(it)]
+    return _table((f"noise {tables.noise_source(it)}", *tables.NOISE_COLUMNS), rows)
 
 
 def _gains(it: Answer) -> list[str]:
     """Table of each sensor's gain as the records show it."""
     rows = [
-        (g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain), "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
-        for g in gains_of_sensors(it)
+        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
+        for g in tables.gains_of_sensors(it)
     ]
     head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")
-    return in_columns([head, *rows]) if 0 < len(rows) <= MANY else []
+    return _table(head, rows)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table; nothing without rows, or with too many of them for a terminal."""
+    return tables.in_columns([head, *rows]) if 0 < len(rows) <= tables.MANY else []
 
 
 def residual_in_words(it: Answer) -> str:
@@ -143,7 +130,7 @@ def fitted_in_words(it: Answer) -> str:
     """The runs that were fitted, and how strongly they move the sensors, where that is known."""
     test = it.records.measurement
     moved = [f"{level:.3g}" for level in sorted(peaks(test))]
-    runs = counted(test.n_runs, "run")
+    runs = tables.counted(test.n_runs, "run")
     if not moved:
         return runs
     to = " to ".join(dict.fromkeys((moved[0], moved[-1])))
@@ -199,7 +186,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
 def _mode_table(it: Answer) -> list[str]:
     """Frequencies, damping and effective masses, with half-widths where they are known and there is room."""
     s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
-    std, many = mass_percent_std(it), is_one_of_many(it)
+    std, many = tables.mass_percent_std(it), tables.is_one_of_many(it)
     shares, k = s.effective_mass_percent, range(s.n)
     columns = [
         ["mode", *(f"{i + 1}" for i in k), "sum"],
@@ -207,55 +194,54 @@ def _mode_table(it: Answer) -> list[str]:
         ["damping, %", *("-" if np.isnan(zeta) else f"{100 * zeta:.4g}" for zeta in it.identified_ratios), ""],
     ]
     if u is not None:
-        columns.insert(2, ["+-", *map(half_width, u.natural_frequencies, s.natural_frequencies), ""])
-        columns.append(["+-", *map(half_width, 100 * u.damping_ratios, 100 * s.damping_ratios), ""])
+        columns.insert(2, ["+-", *map(tables.half_width, u.natural_frequencies, s.natural_frequencies), ""])
+        columns.append(["+-", *map(tables.half_width, 100 * u.damping_ratios, 100 * s.damping_ratios), ""])
     cells = np.vstack([shares, shares.sum(axis=0)])
     marks = np.vstack([many, many.any(axis=0)])
     masses = [
-        [f"mass {axis}, %", *(f"{tilde(mark)}{share:.1f}" for share, mark in zip(*entries, strict=True))]
+        [f"mass {axis}, %", *(f"{tables.tilde(mark)}{share:.1f}" for share, mark in zip(*entries, strict=True))]
         for axis, *entries in zip(axes, cells.T, marks.T, strict=True)
     ]
-    mass_widths = [["+-", *(half_width(value, 100.0) for value in entries), ""] for entries in std.T]
+    mass_widths = [["+-", *(tables.half_width(value, 100.0) for value in entries), ""] for entries in std.T]
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
-    lines = in_columns(zip(*columns, *both, strict=True))
+    lines = tables.in_columns(zip(*columns, *both, strict=True))
     if not np.any(np.isfinite(std)) or len(lines[0]) > WIDTH:
-        lines = in_columns(zip(*columns, *masses, strict=True))
+        lines = tables.in_columns(zip(*columns, *masses, strict=True))
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
-    notes += ["~ one of many values that fit as well"] if many.any() else []
-    return [*lines, "; ".join(notes), *missing_mass(it)]
+    notes += ["~ one of many values that fit as well"] * bool(many.any())
+    return [*lines, "; ".join(notes), *tables.missing_mass(it)]
 
 
 def _deck_masses(it: Answer) -> list[str]:
     """The masses of a lumped model, in one line."""
     masses = [
-        f"{one.name} {tilde(one.one_of_many)}{one.mass:.5g}{known_half_width(one.std, one.mass, ' +-')} kg"
-        for one in deck_masses(it)
+        f"{one.name} {tables.tilde(one.one_of_many)}{one.mass:.5g}"
+        f"{tables.known_half_width(one.std, one.mass, ' +-')} kg"
+        for one in tables.deck_masses(it)
     ]
     return [f"masses at the sensors (diagonal of M_SS): {', '.join(masses)}"] * bool(masses)
 
 
 def _unknowns(it: Answer) -> list[str]:
     """Table of the unknowns that mean something by themselves, where there are some and not too many."""
-    rows = unknown_rows(it)
-    if not 0 < len(rows) <= MANY:
-        return []
     computed = it.quick_uncertainty is not None
     cells = [
         (
-            row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit,
+            row.label, f"{row.value:.6g}", tables.half_width(row.std, row.value) if computed else "-", row.unit,
             row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}",
         )
-        for row in rows
+        for row in tables.unknown_rows(it)
     ]  # fmt: skip
-    return [*in_columns([("unknown", "value", "+- (95 %)", "unit", "search space"), *cells]), ""]
+    lines = _table(("unknown", "value", "+- (95 %)", "unit", "search space"), cells)
+    return [*lines, *[""] * bool(lines)]
 
 
 def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
     for axis, mass, deviation in zip(axes, masses, std, strict=True):
-        words = f"{tilde(it.facts.unit_mass)}{mass:.6g}{known_half_width(deviation, mass, ' +-')}"
+        words = f"{tables.tilde(it.facts.unit_mass)}{mass:.6g}{tables.known_half_width(deviation, mass, ' +-')}"
         yield f"{axis} {words} kg{' m²' * (axis[0] == 'r')}"
 
 
@@ -279,7 +265,7 @@ def _ranges(it: Answer) -> Iterator[str]:
         yield f"  - over all these models the diagonal entries are {', '.join(words)}"
 
 
-def _folded(line: str) -> str:
+def folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     if len(line) <= WIDTH:
         return line

@@ -9,9 +9,8 @@ import pytest
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.checks import run
 from sysid.assessment.checks.against_records import records_of_fit
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.stated import missed_values, stated_masses
 from sysid.search.strategy import Outcome
 

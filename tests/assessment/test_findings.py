@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK, check_records, run
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK
+from sysid.assessment.checks.context import Context, run
+from sysid.assessment.checks.mistakes import check_records
 from sysid.finding import KINDS, Finding, Severity, is_fit, judgement_of, weightiest_first
 from sysid.search.strategy import Outcome
 
@@ -47,9 +48,9 @@ def test_all_but_blocking_checks_wait_for_the_end_of_a_search():
     assert not {"screened", "at_rest", "formulation"} & set(vars(problem))  # nothing is fitted before a search
     assert set(OF_THE_END) < set(QUICK) < set(CHECKS)
     end = Outcome(truth, problem.values(truth), "by hand", False, "no end", sysid.History())
-    assert [one.kind for one in run(Context(problem.prepared, end, cut_short=True))] == ["no solution"]
+    assert [one.kind for one in run(Context(problem.prepared, end, cut_short=True), CHECKS)] == ["no solution"]
     end = Outcome(truth, problem.values(truth), "by hand", False, "no end", sysid.History(), KeyboardInterrupt())
-    assert [one.kind for one in run(Context(problem.prepared, end))] == ["stopped"]
+    assert [one.kind for one in run(Context(problem.prepared, end), CHECKS)] == ["stopped"]
 
 
 @pytest.mark.parametrize(

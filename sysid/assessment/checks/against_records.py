@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context, of_tests
+from sysid.assessment.checks.context import Context, Ended, of_tests
 from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
-from sysid.assessment.checks.stated import MISFIT, force_misfit
+from sysid.assessment.checks.stated import MISFIT, force_misfit, pressure_of
 from sysid.errors import InputError
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
@@ -56,7 +56,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
-    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (2 if velocity else 1):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (1 + velocity):
         return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
@@ -96,14 +96,19 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible, whose, figure = float(np.sqrt(free.squared_error / records.size)), "its poles", "free residues"
+    possible, whose, figure = (
+        max(float(np.sqrt(free.squared_error / records.size)), EXACT),
+        "its poles",
+        "free residues",
+    )
     wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
-    if misfit <= MISFIT * max(possible, EXACT):
+    if misfit <= MISFIT * possible:
         poles = None if formulation.free_modes else PolesAndResidues.of(test)
-        possible = np.inf if poles is None else poles.of_accelerations
+        if poles is None:
+            return
+        possible = max(poles.of_accelerations, EXACT)
         whose, figure = "the poles of the data", "poles of the data"
         wrong = "the form of its mass, stiffness or damping, recovery, or a bound is not the structure's"
-    possible = max(possible, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
@@ -341,12 +346,12 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
     return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"
 
 
-def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
-    """Two sensors that stand in each other's place, by the best fit to the records; none where the model cannot tell.
+def exchanged_sensors(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
+    """Two sensors that stand in each other's place, so that no other search would do better; none where none can tell.
 
-    `wholly`: the exchange must leave no more than free residues do, as there is another cause of the misfit.
+    Where bounds explain the misfit as well, the exchange must leave no more than free residues do.
     """
-    formulation, test = problem.formulation, problem.measurement
+    formulation, test, structure = problem.formulation, problem.measurement, end.structure
     distinguishable = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
     pairs = list(_alike(test))
     if not distinguishable or not 0 < len(pairs) <= 15:  # those of six sensors
@@ -360,7 +365,9 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
     kept = test.residual(structure)
-    if least > MENDED * kept or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
+    if least > MENDED * kept or (others and others[0] < _CLEARLY * least):
+        return ()
+    if least > FREE * floor and pressure_of(problem, end)[1].explains:
         return ()
     names = test.sensor_names
     swapped = Finding(

@@ -51,7 +51,7 @@ class JudgedRecord(NamedTuple):
     channels: tuple[str, ...]
     measured: ComplexArray
     left: ComplexArray
-    variance: Array | None
+    std: Array | None
     """Of the noise at each line; None where it is neither stated nor found."""
 
 
@@ -86,13 +86,13 @@ def _records(modal: ModalEstimate, structure: Structure) -> Iterator[JudgedRecor
     std = test.response_std
     if std is not None and quiet is not None and noise is not None:
         std = _bounded(modal, std, noise.response, left, quiet)
-    yield JudgedRecord("the accelerations", test.sensor_names, test.relative, left, None if std is None else std**2)
+    yield JudgedRecord("the accelerations", test.sensor_names, test.relative, left, std)
     if test.force is not None:
         axes = tuple(f"force {axis}" for axis in test.base_axes or ())
         left, std = test.force - test.predict_force(structure), test.force_std
         if std is not None and quiet is not None and noise is not None and noise.force is not None:
             std = _bounded(modal, std, noise.force, left, quiet)
-        yield JudgedRecord(_FORCE, axes, test.force, left, None if std is None else std**2)
+        yield JudgedRecord(_FORCE, axes, test.force, left, std)
 
 
 def _quiet_base(modal: ModalEstimate) -> Array | None:
@@ -138,11 +138,11 @@ def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np
     Of noise that is not stated, what stands out far from all modes is a part, such as hum.
     """
     in_run, size, missed = test.own_lines, float(np.linalg.norm(record.measured)), float(np.linalg.norm(record.left))
-    variance = np.ones(record.left.shape) if record.variance is None else record.variance
+    variance = np.ones(record.left.shape) if record.std is None else record.std**2
     # Noise that is not stated may be in proportion to the record.
-    if record.variance is None and (test.has_unit_runs or missed < _UNKNOWN * size):
+    if record.std is None and (test.has_unit_runs or missed < _UNKNOWN * size):
         return
-    bounded = record.variance is None or found
+    bounded = record.std is None or found
     if bounded:
         quiet = _quiet(record.left, variance, in_run)
         if quiet is None:
@@ -227,15 +227,8 @@ class Ended(Protocol):
 class Context:
     """A problem with the end of its search, and the findings of the checks that ran before.
 
-    Attributes
-    ----------
-    problem : Prepared
-        With what its records tell of the modes.
-    end : Outcome
-    cut_short : bool
-        The time was over: a poor fit is blamed on nothing else.
-    found : list of Finding
-        Of the checks before, which may explain what a later one would tell.
+    `cut_short`: the time was over, and a poor fit is blamed on nothing else. What was `found` may explain what a later
+    check would tell.
     """
 
     problem: Prepared
@@ -251,8 +244,8 @@ class Context:
     @property
     def is_judged(self) -> bool:
         """True where a search ended by itself; what was stopped on its way has misfits of another kind."""
-        by_itself = self.end.success or (self.problem.free_modes and not self.cut_short)
-        return by_itself and self.end.stopped is None
+        end = self.end
+        return end.stopped is None and (end.success or (self.problem.free_modes and not self.cut_short))
 
     @cached_property
     def named(self) -> tuple[Finding, ...]:
@@ -302,6 +295,15 @@ class Context:
 
 
 Check = Callable[[Context], Iterator[Finding]]
+
+
+def run(context: Context, checks: Iterable[Check]) -> list[Finding]:
+    """Run checks one after the other; what they found is added to the context, each finding once."""
+    for check in checks:
+        for one in check(context):
+            if one not in context.found:
+                context.found.append(one)
+    return context.found
 
 
 def of_tests(found: Sequence[Iterable[Finding]]) -> Iterator[Finding]:

@@ -88,7 +88,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
-    count = poles[0].size * test.n_base * (2 if velocity else 1)
+    count = poles[0].size * test.n_base * (1 + velocity)
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 2 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)
         return GainErrors(unknown, unknown, np.zeros(test.n_sensors), 1)
@@ -211,9 +211,10 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
     """
     for i in np.flatnonzero(np.any(test.rigid_body, axis=1)):
         size, open_ = 100 * abs(errors.error[i]), 100 * LIKELY * errors.std[i]
-        reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
+        reach, gain = size + open_, f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}"
+        if not np.isfinite(errors.error[i]):
+            reach, gain = _UNSHOWN, "not shown"
         if worth[i] * reach > most_deviations():
-            gain = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
             yield Finding(
                 "gain not shown", Severity.NOTE,
                 f"the intervals of M_SS take the gain of {test.sensor_names[i]} to be exactly 1, and the records do "

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sysid.assessment.checks.against_records import unresolved
 from sysid.assessment.checks.context import Context, of_tests
 from sysid.assessment.checks.stated import wrong_statements
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.files.units import STANDARD_GRAVITY
 from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.in_time import as_whole
@@ -92,12 +92,10 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
 def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectTerms]:
     """Sensors whose records are late against the base's, and the terms of the records without that delay."""
     total = np.zeros(test.n_sensors)
-    first: Array | None = None
     for _ in range(3):  # times that a delay is taken off
         found = _delays(test, terms)
         if found is None:
             break
-        first = found if first is None else first
         total += found
         if test.is_whole:  # a record turned by its spectrum begins with its end
             break
@@ -106,9 +104,9 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
         if mended is None or mended.misfit > AS_GOOD * terms.misfit:
             return [], terms
         terms = mended
-    if first is None:
-        return [], terms
     which = np.flatnonzero(total)
+    if not which.size:
+        return [], terms
     of_all = which.size == np.count_nonzero(np.any(test.rigid_body, axis=1)) and which.size > 1
     who = "the records of all sensors are" if of_all else f"the record of {_names(test, which)} is"
     delay = float(np.mean(total[which]))
@@ -378,19 +376,20 @@ def wrong_records(context: Context) -> Iterator[Finding]:
     yield from context.named
 
 
-def mistakes_before_search(prepared: Prepared) -> Iterator[Finding]:
-    """Mistakes that the records of a problem show before a search.
+def check_records(prepared: Prepared) -> tuple[Finding, ...]:
+    """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
 
-    Blocking where it spoils all channels, or a channel of a problem whose model has a form of its own, so that a
-    search would be in vain.
+    Raises InputError where one spoils all channels, or a channel of a problem whose model has a form of its own, so
+    that a search would be in vain.
     """
     problem, declared = prepared.stated, prepared.stated.declared
-    tests = [problem.measurement] if problem.misfit is None else []
+    tests = [problem.measurement] * (problem.misfit is None)
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
-    found = [_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests]
-    for one in of_tests(found):
-        in_vain = is_gross(one) and not declared.free_modes
-        yield one._replace(severity=Severity.BLOCKING) if in_vain else one
+    found = of_tests([_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests])
+    every = tuple(found)
+    in_vain = [one.severity is Severity.BLOCKING or (is_gross(one) and not declared.free_modes) for one in every]
+    refuse(*zip(in_vain, map(str, every), strict=True))
+    return every
 
 
 def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:

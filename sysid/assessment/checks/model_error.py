@@ -78,11 +78,11 @@ def other_levels(context: Context) -> Iterator[Finding]:
         if not (fitted and levels):
             continue
         if max(levels) > LEVEL * max(fitted) or max(levels) < min(fitted) / LEVEL:
-            span = f"{max(fitted):.3g}" if len(fitted) == 1 else f"{min(fitted):.3g} to {max(fitted):.3g}"
+            span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(fitted), max(fitted))))
             yield Finding(
                 "level", Severity.NOTE,
                 f"test {i} that was not fitted moves the sensors by up to {max(levels):.3g} m/s² against the base, the "
-                f"fitted {'run' if len(fitted) == 1 else 'runs'} by {span} m/s²: what holds at one level need not "
+                f"fitted run{'s' * (len(fitted) > 1)} by {span} m/s²: what holds at one level need not "
                 "hold at another",
                 numbers={"test": float(i), "peak": float(max(levels)), "fitted": float(max(fitted))},
             )  # fmt: skip
@@ -200,10 +200,7 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
 def changing(problem: Prepared, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
     """The mode whose frequency changes most between stretches of all records; none where none does.
 
-    Parameters
-    ----------
-    problem : Prepared
-        Tests that were never fitted are looked at too, where the levels of all are known.
+    Tests that were never fitted are looked at too, where the levels of all are known.
     """
     found = changes(problem)
     if not found:
@@ -317,7 +314,7 @@ def noise_findings(modal: ModalEstimate) -> Iterator[Finding]:
     test = modal.records
     axes = test.base_axes or ()
     names = [*test.sensor_names]
-    names += [f"force {axis}" for axis in axes] if test.force is not None else []
+    names += [f"force {axis}" for axis in axes] * (test.force is not None)
     names += [f"base {axis}" for axis in axes]
     name = lambda one: names[one.channel] + of_run(one.run, test.n_runs)  # noqa: E731
     for one in modal.varying:

@@ -40,7 +40,7 @@ def _no_end(kind: Kind, message: str) -> Finding:
 
 def untried_modes(context: Context) -> Iterator[Finding]:
     """The fit of whole records was stopped before all modes were tried."""
-    yield from of_tests([[_untried(modal.omega.size)] * modal.stopped for modal in context.problem.modal])
+    yield from of_tests([[_untried(modal.omega.size)] * bool(modal.stopped) for modal in context.problem.modal])
 
 
 def _untried(modes: int) -> Finding:
@@ -95,7 +95,7 @@ def lines_left_out(context: Context) -> Iterator[Finding]:
     """Lines are left out for all channels, as a record holds NaN there."""
     problem, formulation = context.problem, context.problem.formulation
     # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
-    fitted = [problem.measurement] if formulation.fits_records else []
+    fitted = [problem.measurement] * formulation.fits_records
     tests = [*fitted, *(term.test for term in formulation.further_tests)]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:

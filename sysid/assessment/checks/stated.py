@@ -416,22 +416,22 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
         low, high = np.min(frequencies, axis=0), np.max(frequencies, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
+    modes, between = ", ".join(f"{f:.4g}" for f in found[:4]), "and a factor of 2 pi = 6.283 lies between"
+    numbers = {"stated": float(low[0]), "found": float(found[0])}
     if stated is not None and found[0] < low[0] / MISFIT and inside(2 * np.pi * found):
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
             f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
-            f"stated, the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz, and a factor of 2 pi = "
-            "6.283 lies between",
-            "divide what is stated by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
+            f"stated, the records have modes at {modes} Hz, {between}",
+            "divide what is stated by 2 pi", numbers=numbers,
         )  # fmt: skip
-    mended = found / (2 * np.pi)
-    if found[0] > MISFIT * high[0] and inside(mended):
+    if found[0] > MISFIT * high[0] and inside(found / (2 * np.pi)):
         span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
-            f"the lines are in rad/s, not Hz: the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz "
-            f"as they are given, {what} {span} Hz, and a factor of 2 pi = 6.283 lies between",
-            "divide the frequencies by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
+            f"the lines are in rad/s, not Hz: the records have modes at {modes} Hz as they are given, {what} {span} "
+            f"Hz, {between}",
+            "divide the frequencies by 2 pi", numbers=numbers,
         )  # fmt: skip
 
 
