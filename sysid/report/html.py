@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -76,6 +77,7 @@ nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
 .controls select, .controls button { font: inherit; color: var(--ink); background: var(--fill);
   border: 1px solid var(--soft); border-radius: 4px; padding: .15rem .5rem; max-width: 100%; }
 .controls label { max-width: 100%; }
+.option { white-space: nowrap; }
 .area { touch-action: pan-y; user-select: none; margin-top: .4rem; }
 .shapes { display: flex; flex-wrap: wrap; gap: .5rem; } .shapes svg { flex: 0 0 auto; }
 .told { min-height: 3em; font-variant-numeric: tabular-nums; font-size: .9rem; }
@@ -88,7 +90,9 @@ svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke
 svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
 svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
-svg .dot { fill: var(--found); } svg .dots { stroke: var(--found); stroke-width: 6; stroke-linecap: round; }
+svg .dot { fill: var(--found); } svg .place { fill: var(--seen); }
+svg .dots, svg .places { stroke: var(--found); stroke-width: 6; stroke-linecap: round; }
+svg .places { stroke: var(--seen); }
 svg .base { fill: var(--soft); }
 .legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
 .key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
@@ -100,7 +104,7 @@ svg .base { fill: var(--soft); }
 .sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  td:first-child { max-width: 9em; }
+  td:first-child { max-width: 9em; } table:has(th:first-child:empty) td:first-child { min-width: 5em; }
   .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
   h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
   .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
@@ -111,7 +115,8 @@ svg .base { fill: var(--soft); }
   .shapes svg { display: inline-block; width: 24%; }
   .shapes, .sheets { orphans: 1; widows: 1; }
   .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
-  .maps { display: block; } .maps figure { display: inline-block; width: 32%; } .maps img { width: 100%; }
+  .maps { display: block; break-after: avoid; } .maps img { width: 100%; }
+  .maps figure { display: inline-block; width: 32%; margin-right: 1%; }
   .pair { flex-wrap: nowrap; break-inside: avoid; } .pair figure { flex-basis: 0; }
   table { font-size: 7.5pt; } .words { font-size: 9pt; } .wide { font-size: 5.5pt; }
   th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
@@ -133,22 +138,31 @@ def escaped(value: object) -> str:
     return html.escape(shown_plainly(str(value)), quote=True)
 
 
+def prose(value: object) -> str:
+    """Escape a sentence; an option of a command, such as --leave-out, is not broken over two lines."""
+    return re.sub(r"--[a-z][a-z-]*", r'<span class="option">\g<0></span>', escaped(value))
+
+
 def number(value: float | None, digits: int = 4) -> str:
-    """Write a number with so many significant digits; a dash for what is not there."""
+    """Write a number with so many significant digits; a dash for what is not there.
+
+    Without a power of ten from 0.0001 to a million: 600000 and not 6e+05.
+    """
     if value is None or not np.isfinite(value):
         return "–"
-    return f"{value + 0.0:.{digits}g}"  # a zero has no sign
+    return f"{float(f'{value + 0.0:.{digits}g}'):.{max(digits, 6)}g}"  # a zero has no sign
 
 
 def aligned(value: float | None) -> str:
     """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
     digits = number(value, 3)
-    return digits if "e" in digits or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
+    whole = "e" in digits or len(digits) > 3 and "." not in digits
+    return digits if whole or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
 def paragraph(value: object, kind: str = "") -> str:
     """Set a paragraph of plain text."""
-    return f"<p{_class(kind)}>{escaped(value)}</p>"
+    return f"<p{_class(kind)}>{prose(value)}</p>"
 
 
 def sentence(words: str) -> str:
@@ -158,7 +172,7 @@ def sentence(words: str) -> str:
 
 def bullets(sentences: Iterable[object]) -> str:
     """Set a list of plain sentences; nothing where there are none."""
-    items = "".join(f"<li>{escaped(s)}</li>" for s in sentences)
+    items = "".join(f"<li>{prose(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
 
 
@@ -221,14 +235,15 @@ def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
     return [[()] * shape[1] for _ in range(shape[0])]
 
 
-def picture(figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15) -> str:
+def picture(figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15, bottom: float = 1.0) -> str:
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens.
 
-    Its margins are fixed, the `right` one in inches: to find them by drawing takes as long as the picture.
+    Its margins are fixed, `right` and `bottom` in inches: to find them by drawing takes as long as the picture. The
+    lower one has room for a legend below the axis.
     """
     width, height = map(float, figure.get_size_inches())
     figure.set_layout_engine(None)
-    figure.subplots_adjust(left=0.75 / width, right=1 - right / width, bottom=1.0 / height, top=1 - 0.35 / height)
+    figure.subplots_adjust(left=0.75 / width, right=1 - right / width, bottom=bottom / height, top=1 - 0.35 / height)
     image = _image(to_png(figure, dpi=130, colours=64), f'width="{round(92 * width)}" alt="{escaped(alt)}"')
     return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
 

@@ -48,8 +48,9 @@ def matrix_tables(it: Identification) -> str:
     lower = list(map(half_widths, (M, K, C), stds))
     if label:
         lower[2] = no_lines(C.shape)  # half-widths about one choice tell less than its mark
-        words += _ENDS_ELSEWHERE if ends is None else _ENDS_BELOW
+        words += _ENDS_ELSEWHERE * (ends is None)
     if ends is not None:
+        words += _ENDS_BELOW
         lower[:2] = map(_ranges, (ends.mass, ends.stiffness), lower[:2])
     parts = [
         paragraph(words, "soft"),
@@ -103,10 +104,15 @@ def stated(it: Identification) -> Array:
 
 
 def _ranges(ends: Array, otherwise: Lines) -> Lines:
-    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
+    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one.
+
+    They are one where the three digits that are shown are the same.
+    """
     lines = [list(line) for line in otherwise]
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])
+        if least == most != "–":
+            continue
         bounded = np.isfinite(ends[:, i, j])
         words_of = {
             (True, True): (f"{least} to", most),

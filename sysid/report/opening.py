@@ -9,13 +9,12 @@ import numpy as np
 
 from sysid.assessment.checks.noise_multiples import noise_at_most
 from sysid.measurement.measurement import Measurement
-from sysid.report.html import bullets, escaped, number, paragraph, sentence, table
+from sysid.report.html import bullets, escaped, number, paragraph, prose, sentence, table
 from sysid.report.matrices import stated
 from sysid.results.identification import Identification
 from sysid.results.summary import FIRST, JUDGEMENTS, fitted_in_words, next_steps, verdict
 from sysid.results.tables import counted, deck_masses, half_width, unknown_rows
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import LIKELY
 
 _COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
 _HOLDS = (
@@ -44,7 +43,7 @@ class NoiseLevel(NamedTuple):
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
-    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
+    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {prose(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
@@ -159,12 +158,18 @@ def _beside(noise: float, level: NoiseLevel) -> str:
 
 
 def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
-    """A value to two digits of half of its 95 % interval, and that; with so many `digits` where noise leaves none."""
+    """A value to two digits of half of its 95 % interval, and that; with so many `digits` where noise leaves none.
+
+    Both have a power of ten where a compliance would have ten places, or a stiffness eight digits.
+    """
     width = half_width(std, value)
     if width in ("open", "0"):
         return number(value, digits), width
-    places = int(np.clip(1 - np.floor(np.log10(LIKELY * std)), 0, 9))
-    return f"{value + 0.0:.{places}f}", f"{LIKELY * std:.{places}f}"
+    half, largest = float(width), np.floor(np.log10(max(abs(value), float(width))))
+    places = 1 - int(np.floor(np.log10(half)))
+    if places > 9 or largest > 6:
+        return f"{value + 0.0:.{max(places + int(largest), 1)}e}", f"{half:.1e}"
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}", f"{half:.{max(places, 0)}f}"
 
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:

@@ -39,7 +39,6 @@ from sysid.results.tables import (
     gains_of_sensors,
     half_width,
     is_one_of_many,
-    known_half_width,
     mass_percent_std,
     missing_mass,
     noise_of_channels,
@@ -162,8 +161,7 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), width_text(half_width(row.std, row.value)), row.unit, number(row.lower),
-            number(row.upper), row.on_bound,
+            row.label, *rounded(row.value, row.std, 6), row.unit, number(row.lower), number(row.upper), row.on_bound,
         )
         for row in unknown_rows(it)
     ]  # fmt: skip
@@ -224,9 +222,16 @@ def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[ob
     """Effective masses of all modes and their sum, a column a base direction."""
     share, std = it.structure.effective_mass_percent, mass_percent_std(it)
     for i, axis in enumerate(it.measurement.base_axes or ()):
-        below = [tuple(filter(None, (known_half_width(value, 100.0, "±"),))) for value in std[:, i]]
+        below = [_below_percent(half_width(value, 100.0)) for value in std[:, i]]
         cells = [Cell(f"{tilde(one)}{v:.2f}", b) for v, one, b in zip(share[:, i], many[:, i], below, strict=True)]
         yield [f"effective mass {axis} [%]", *cells, f"{tilde(many[:, i])}{share[:, i].sum():.2f}"]
+
+
+def _below_percent(width: str) -> tuple[str, ...]:
+    """Line below a share that is told to 0.01 %: half of its 95 % interval, where that is known and not round-off."""
+    if width in ("open", "0"):
+        return ()
+    return (f"± {width_text(width)}" if float(width) >= 0.005 else "± <0.01",)
 
 
 def _rigid_body_mass(it: Identification) -> str:
@@ -290,8 +295,8 @@ def _gains(it: Identification) -> str:
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
     head, found = ["sensor", "gain", "±"], gains_of_sensors(it)
-    rows = [[g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain)] for g in found]
-    if it.determined and any(np.isfinite(g.worth) for g in found):  # else M_SS has no deviation
+    rows = [[g.sensor, *rounded(g.gain, g.std)] for g in found]
+    if it.determined and any(g.worth > 0 for g in found):  # else M_SS has no deviation, or was stated
         head.append("1 % moves M_SS by, deviations")
         caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
         for row, gain in zip(rows, found, strict=True):
@@ -387,7 +392,7 @@ def _convergence(it: Identification) -> str:
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
-    parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
+    parts = [picture(plot.convergence(it), alt, caption, bottom=0.6)] if _falls(it) else []
     columns = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
     rows = [[row[k] for k in columns] for row in ran]
     parts.append(table([COLUMNS[k] for k in columns], rows, f"{note}.", words=True))

@@ -147,9 +147,11 @@ def mode_still(
     """
     rest, moved = (_seen(where, size) for where in (points, points + shape))
     joined = [_joined(where, sticks) for where in (rest, moved)]
-    at_rest = f'<path id="{_AT_REST}" class="rest" d="{joined[0]}"/>' if first else f'<use href="#{_AT_REST}"/>'
-    lines = f'{at_rest}<path class="identified" d="{joined[1]}"/>'
-    dots = f'<path class="dots" d="{"".join(f"M{_pair(point)}h0" for point in moved[1:])}"/>'
+    still, dots = ("".join(f"M{_pair(point)}h0" for point in where[1:]) for where in (rest, moved))
+    at_rest = f'<g id="{_AT_REST}"><path class="rest" d="{joined[0]}"/><path class="places" d="{still}"/></g>'
+    shown = at_rest if first else f'<use href="#{_AT_REST}"/>'
+    lines = f'{shown}<path class="identified" d="{joined[1]}"/>'
+    dots = f'<path class="dots" d="{dots}"/>'
     x, y = rest[0]
     base = f'<rect class="base" x="{x - 22:.1f}" y="{y - 3:.1f}" width="44" height="6"/>'
     base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'
@@ -221,9 +223,12 @@ def _upward(panel: _Panel, bottom: float, top: float, margin: float = 1.3) -> _A
 
 
 def _log_ticks(low: float, high: float, room: float) -> list[float]:
-    """Powers of ten, with their double and fivefold where `room` has as many, some left out where it has not."""
+    """Powers of ten, with their double and fivefold or their threefold as `room` has it, some left out where it has not.
+
+    So that a logarithmic axis of a decade or more has two numbers at least.
+    """
     decades = np.log10(high / low)
-    factors = (1, 2, 5) if 3 * decades <= room else (1,)
+    factors = next((some for some in ((1, 2, 5), (1, 3)) if len(some) * decades <= room), (1,))
     every = int(np.ceil(decades / room))
     powers = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     numbers = (float(f"{k}e{int(power)}") for power in powers if power % every == 0 for k in factors)

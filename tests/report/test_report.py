@@ -150,7 +150,7 @@ def test_modes_and_their_reference_are_told(complete, page):
     assert f"{100 * (np.sqrt(1.02) - 1):+.2g}" in text
     for matrix in (ours.mass, ours.stiffness[:3, :3], ours.damping):
         for value in matrix.ravel():
-            assert f"{value:.4g}" in text
+            assert plain(value) in text
 
 
 def test_what_is_absent_leaves_no_section(plain, no_pictures):
@@ -226,8 +226,12 @@ def modal(truth):
     return identified
 
 
+def plain(value, digits=4):
+    return f"{float(f'{value + 0.0:.{digits}g}'):.6g}"  # 110, not 1.1e+02
+
+
 def half(std):
-    return f"{float(f'{norm.ppf(0.975) * std:.2g}'):.6g}"  # 110, not 1.1e+02
+    return plain(norm.ppf(0.975) * std, 2)
 
 
 def to_two_digits(value, std):
@@ -256,7 +260,7 @@ def test_what_is_determined_stands_with_half_of_its_95_percent_interval(modal, n
     M, K = s.mass[:3, :3], s.stiffness[:3, :3]
     for table, values, std in zip(square, (M, K, s.damping), (u.mass, u.stiffness, u.damping), strict=True):
         for name, row, own, wide in zip(names, table[1:], values, std, strict=True):
-            assert row == [name, *(f"{v:.4g}|± {half(w)}" for v, w in zip(own, wide, strict=True))]
+            assert row == [name, *(f"{plain(v)}|± {half(w)}" for v, w in zip(own, wide, strict=True))]
 
 
 def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, no_pictures):
@@ -274,7 +278,7 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
     assert len(square) == 3
     for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
         for i, j in np.ndindex(3, 3):
-            low, high = (f"{end + 0.0:.3g}" for end in ends[:, i, j])
+            low, high = (plain(end, 3) for end in ends[:, i, j])
             assert table[i + 1][j + 1].split("|")[1:] == [f"{low} to", high]
     assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
     assert page.words.count("one of many") == 6  # matrices and their heat maps; pictures are left out here
