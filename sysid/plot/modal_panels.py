@@ -15,10 +15,10 @@ from sysid.plot.canvas import COLOURS, FAINT, IDENTIFIED, INK, MEASURED, dress, 
 from sysid.plot.panels import broken
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
 
 # New poles stay in the background; what is stable in everything stands out.
 _MARKS: tuple[dict[str, Any], ...] = (
@@ -69,13 +69,15 @@ def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
     for name, spine in behind.spines.items():
         spine.set_visible(name == "right")
     # What is surest is told first.
-    _legend_below(ax, list(reversed(ax.get_lines())), 3)
+    legend_below(ax, list(reversed(ax.get_lines())), 3)
 
 
 def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     """All singular values of the FRFs at each line; found modes as vertical lines."""
     test, modes, label = _modes_of(subject)
     values, reason, unit = _indicator(test)
+    # Runs of other lengths have other lines: where they are alone, there is one singular value.
+    values = values[np.median(values, axis=1) > ROUND_OFF * values.max()]
     for curve, style in zip(values, _CURVES, strict=False):
         ax.plot(broken(test.freq, test.gaps), broken(positive(curve), test.gaps), zorder=3, **style)
     frequency_axis(ax, test.freq)
@@ -84,7 +86,7 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     if reason:
         _remark(ax, f"Singular values of the runs' own spectra: {reason}.")
     dress(ax, "Complex mode indicator function", "frequency [Hz]", f"singular value{unit}")
-    _legend_below(ax, ax.get_lines(), 4)
+    legend_below(ax, ax.get_lines(), 4)
 
 
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:
@@ -133,8 +135,9 @@ def _mode_lines(ax: Axes, modes: Array, label: str) -> None:
         ax.axvline(mode, **{**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5, "label": name})
 
 
-def _legend_below(ax: Axes, lines: Sequence[Line2D], columns: int) -> None:
-    handles = [line for line in lines if not str(line.get_label()).startswith("_")]
+def legend_below(ax: Axes, drawn: Sequence[Any], columns: int) -> None:
+    """Set the legend of what is drawn below the x axis, where it covers nothing."""
+    handles = [one for one in drawn if not str(one.get_label()).startswith("_")]
     ax.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.6, ncols=columns,
         frameon=False, fontsize="small", columnspacing=1.4, handlelength=1.6,

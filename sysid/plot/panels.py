@@ -169,18 +169,27 @@ def panels(channels: Sequence[PlottedChannel], *, alone: float = 6.4) -> Figure:
     left = 0.92 if "\n" in channels[0].quantity else 0.72
     grid = figure.add_gridspec(
         blocks, columns, left=left / width, right=1 - 0.12 / width, bottom=0.75 / height, top=1 - 0.3 / height,
-        wspace=0.24, hspace=0.3,
+        wspace=0.24 if len({(one.quantity, one.phase) for one in channels}) == 1 else 0.36, hspace=0.3,
     )  # fmt: skip
+    drawn: list[Any] = []
     for at, channel in enumerate(channels):
         axes: Any = grid[divmod(at, columns)].subgridspec(2, 1, height_ratios=[2.2, 1], hspace=0.12).subplots()
         draw(axes, channel)
         axes[0].yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
-        before = channels[at - 1]
-        for ax, same in zip(axes, (channel.quantity == before.quantity, channel.phase == before.phase), strict=True):
-            if at % columns and same:  # what is shared along a row is said once
-                ax.set_ylabel("")
+        drawn.append(axes)
+    for first in range(0, len(drawn), columns):
+        for row in zip(*drawn[first : first + columns], strict=True):
+            label_once(row)
     figure.legend(handles=key(figure.axes), loc="lower center", ncols=5, frameon=False, fontsize="small")
     return figure
+
+
+def label_once(row: Sequence[Axes]) -> None:
+    """Keep of axes beside each other the labels upwards that differ from the one before."""
+    labels = [ax.get_ylabel() for ax in row]
+    for ax, before, label in zip(row[1:], labels, labels[1:], strict=False):
+        if label == before:
+            ax.set_ylabel("")
 
 
 def key(axes: Iterable[Axes]) -> list[Any]:

@@ -156,7 +156,7 @@ def number(value: float | None, digits: int = 4) -> str:
 def aligned(value: float | None) -> str:
     """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
     digits = number(value, 3)
-    whole = "e" in digits or len(digits) > 3 and "." not in digits
+    whole = "e" in digits or (len(digits) > 3 and "." not in digits)
     return digits if whole or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
@@ -235,7 +235,9 @@ def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
     return [[()] * shape[1] for _ in range(shape[0])]
 
 
-def picture(figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15, bottom: float = 1.0) -> str:
+def picture(
+    figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15, bottom: float = 1.0
+) -> str:
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens.
 
     Its margins are fixed, `right` and `bottom` in inches: to find them by drawing takes as long as the picture. The

@@ -223,7 +223,7 @@ def _upward(panel: _Panel, bottom: float, top: float, margin: float = 1.3) -> _A
 
 
 def _log_ticks(low: float, high: float, room: float) -> list[float]:
-    """Powers of ten, with their double and fivefold or their threefold as `room` has it, some left out where it has not.
+    """Powers of ten, with double and fivefold, or threefold, as there is `room`; some left out where there is not.
 
     So that a logarithmic axis of a decade or more has two numbers at least.
     """

@@ -15,9 +15,9 @@ from scipy.stats import norm
 import sysid
 from sysid.finding import Finding, Severity
 from sysid.report import opening, report
-from sysid.report.html import aligned
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY
-from sysid.report.opening import noise_of_test
+from sysid.report.html import aligned, number, paragraph
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, _ranges
+from sysid.report.opening import noise_of_test, rounded
 from sysid.results.summary import residual_in_words
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -292,10 +292,43 @@ def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictur
 
 
 @pytest.mark.parametrize(
-    ("value", "told"), [(0.8961, "0.896"), (1.0, "1.00"), (123.4, "123"), (0.0, "0"), (1e-7, "1e-07"), (np.nan, "–")]
+    ("value", "told"),
+    [(0.8961, "0.896"), (1.0, "1.00"), (123.4, "123"), (0.0, "0"), (1e-7, "1e-07"), (1234.0, "1230"), (np.nan, "–")],
 )
 def test_numbers_of_a_column_keep_the_zeros_at_their_ends(value, told):
     assert aligned(value) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(6e5, "600000"), (561_712.0, "561700"), (-0.0, "0"), (1.234e7, "1.234e+07"), (2e-5, "2e-05")]
+)
+def test_a_number_has_a_power_of_ten_only_from_a_million_on(value, told):
+    assert number(value) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "told"),
+    [
+        (2471.384, 7.34, ("2471.4", "7.3")),
+        (900_446.2, 2251.0, ("900400", "2300")),
+        (1.27431e8, 3.1e5, ("1.2743e+08", "3.1e+05")),
+        (4.5678e-9, 1.2e-12, ("4.5678e-09", "1.2e-12")),
+        (-3e-4, 0.04, ("0.000", "0.040")),
+        (99.97, 0.996, ("100.0", "1.0")),
+    ],
+)
+def test_a_value_is_rounded_to_two_digits_of_its_interval(value, half, told):
+    assert rounded(value, half / norm.ppf(0.975)) == told
+
+
+def test_a_range_that_is_one_value_in_three_digits_is_left_to_its_interval():
+    otherwise = [[("± 0.1",), ("± 0.2",)], [("± 0.2",), ("± 0.3",)]]
+    ends = np.array([[[1.0, -2.0], [-2.0, 3.0]], [[1.0001, 2.0], [2.0, np.inf]]])
+    assert _ranges(ends, otherwise) == [[("± 0.1",), ("-2 to", "2")], [("-2 to", "2"), ("from 3",)]]
+
+
+def test_an_option_of_a_command_stays_on_one_line():
+    assert '<span class="option">--leave-out</span> run' in paragraph("'sysid refine RESULT --leave-out run'")
 
 
 def test_blocks_of_the_base_that_are_zero_are_a_line(written, no_pictures):
