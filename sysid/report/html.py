@@ -104,7 +104,7 @@ svg .base { fill: var(--soft); }
 .sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  td:first-child { max-width: 9em; } table:has(th:first-child:empty) td:first-child { min-width: 5em; }
+  td:first-child { max-width: 9em; } table:has(th:first-child:empty) td:first-child { min-width: 6em; }
   .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
   h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
   .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
