@@ -185,7 +185,7 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         elif high < 30 * low:
             plain_log(ax.yaxis)
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(frameon=False, fontsize="small")
+        legend_below(ax, ax.get_lines(), 2)
     else:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
     x_label = "iteration, swarm then local phase" if swarm.size else "iteration"

@@ -90,10 +90,9 @@ svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke
 svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
 svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
-svg .dot { fill: var(--found); } svg .place { fill: var(--seen); }
+svg .dot { fill: var(--found); } svg .place { fill: var(--seen); } svg .base { fill: var(--soft); }
 svg .dots, svg .places { stroke: var(--found); stroke-width: 6; stroke-linecap: round; }
 svg .places { stroke: var(--seen); }
-svg .base { fill: var(--soft); }
 .legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
 .key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
@@ -144,10 +143,7 @@ def prose(value: object) -> str:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Write a number with so many significant digits; a dash for what is not there.
-
-    Without a power of ten from 0.0001 to a million: 600000 and not 6e+05.
-    """
+    """Write a number with so many significant digits, up to a million without power of ten; a dash for none."""
     if value is None or not np.isfinite(value):
         return "–"
     return f"{float(f'{value + 0.0:.{digits}g}'):.{max(digits, 6)}g}"  # a zero has no sign
@@ -235,17 +231,14 @@ def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
     return [[()] * shape[1] for _ in range(shape[0])]
 
 
-def picture(
-    figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15, bottom: float = 1.0
-) -> str:
+def picture(figure: Figure, alt: object, caption: object = "", *, label: str = "", right: float = 0.15) -> str:
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens.
 
-    Its margins are fixed, `right` and `bottom` in inches: to find them by drawing takes as long as the picture. The
-    lower one has room for a legend below the axis.
+    Its margins are fixed, the `right` one in inches: to find them by drawing takes as long as the picture.
     """
     width, height = map(float, figure.get_size_inches())
     figure.set_layout_engine(None)
-    figure.subplots_adjust(left=0.75 / width, right=1 - right / width, bottom=bottom / height, top=1 - 0.35 / height)
+    figure.subplots_adjust(left=0.75 / width, right=1 - right / width, bottom=1.0 / height, top=1 - 0.35 / height)
     image = _image(to_png(figure, dpi=130, colours=64), f'width="{round(92 * width)}" alt="{escaped(alt)}"')
     return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
 

@@ -104,10 +104,7 @@ def stated(it: Identification) -> Array:
 
 
 def _ranges(ends: Array, otherwise: Lines) -> Lines:
-    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one.
-
-    They are one where the three digits that are shown are the same.
-    """
+    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they look alike."""
     lines = [list(line) for line in otherwise]
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])

@@ -158,16 +158,13 @@ def _beside(noise: float, level: NoiseLevel) -> str:
 
 
 def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
-    """A value to two digits of half of its 95 % interval, and that; with so many `digits` where noise leaves none.
-
-    Both have a power of ten where a compliance would have ten places, or a stiffness eight digits.
-    """
+    """A value to two digits of half of its 95 % interval, and that; with so many `digits` where noise leaves none."""
     width = half_width(std, value)
     if width in ("open", "0"):
         return number(value, digits), width
     half, largest = float(width), np.floor(np.log10(max(abs(value), float(width))))
     places = 1 - int(np.floor(np.log10(half)))
-    if places > 9 or largest > 6:
+    if places > 9 or largest > 6:  # such as a compliance, or a large stiffness
         return f"{value + 0.0:.{max(places + int(largest), 1)}e}", f"{half:.1e}"
     return f"{round(value, places) + 0.0:.{max(places, 0)}f}", f"{half:.{max(places, 0)}f}"
 

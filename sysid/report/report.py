@@ -392,7 +392,7 @@ def _convergence(it: Identification) -> str:
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
-    parts = [picture(plot.convergence(it), alt, caption, bottom=0.6)] if _falls(it) else []
+    parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
     columns = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
     rows = [[row[k] for k in columns] for row in ran]
     parts.append(table([COLUMNS[k] for k in columns], rows, f"{note}.", words=True))

@@ -223,10 +223,7 @@ def _upward(panel: _Panel, bottom: float, top: float, margin: float = 1.3) -> _A
 
 
 def _log_ticks(low: float, high: float, room: float) -> list[float]:
-    """Powers of ten, with double and fivefold, or threefold, as there is `room`; some left out where there is not.
-
-    So that a logarithmic axis of a decade or more has two numbers at least.
-    """
+    """Powers of ten, with double and fivefold, or threefold, as there is `room`; some left out where there is not."""
     decades = np.log10(high / low)
     factors = next((some for some in ((1, 2, 5), (1, 3)) if len(some) * decades <= room), (1,))
     every = int(np.ceil(decades / room))
