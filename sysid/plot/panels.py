@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.plot.canvas import (
+    COLOURS,
     FAINT,
     IDENTIFIED,
     INK,
@@ -29,16 +32,6 @@ from sysid.structure.thresholds import LIKELY, ROUND_OFF
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-from typing import TYPE_CHECKING
-
-from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
-from sysid.modal_analysis.vector_fitting import find_poles
-from sysid.plot.canvas import COLOURS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
-
 
 _BAND: dict[str, Any] = {
     "color": IDENTIFIED["color"], "alpha": 0.25, "linewidth": 0, "label": "95 % band", "zorder": 1.5,
@@ -170,18 +163,27 @@ def panels(channels: Sequence[PlottedChannel], *, alone: float = 6.4) -> Figure:
     left = 0.92 if "\n" in channels[0].quantity else 0.72
     grid = figure.add_gridspec(
         blocks, columns, left=left / width, right=1 - 0.12 / width, bottom=0.75 / height, top=1 - 0.3 / height,
-        wspace=0.24, hspace=0.3,
+        wspace=0.24 if len({(one.quantity, one.phase) for one in channels}) == 1 else 0.36, hspace=0.3,
     )  # fmt: skip
+    drawn: list[Any] = []
     for at, channel in enumerate(channels):
         axes: Any = grid[divmod(at, columns)].subgridspec(2, 1, height_ratios=[2.2, 1], hspace=0.12).subplots()
         draw(axes, channel)
         axes[0].yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
-        before = channels[at - 1]
-        for ax, same in zip(axes, (channel.quantity == before.quantity, channel.phase == before.phase), strict=True):
-            if at % columns and same:  # what is shared along a row is said once
-                ax.set_ylabel("")
+        drawn.append(axes)
+    for first in range(0, len(drawn), columns):
+        for row in zip(*drawn[first : first + columns], strict=True):
+            label_once(row)
     figure.legend(handles=key(figure.axes), loc="lower center", ncols=5, frameon=False, fontsize="small")
     return figure
+
+
+def label_once(row: Sequence[Axes]) -> None:
+    """Keep of axes beside each other the labels upwards that differ from the one before."""
+    labels = [ax.get_ylabel() for ax in row]
+    for ax, before, label in zip(row[1:], labels, labels[1:], strict=False):
+        if label == before:
+            ax.set_ylabel("")
 
 
 def key(axes: Iterable[Axes]) -> list[Any]:
@@ -344,13 +346,15 @@ def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
     for name, spine in behind.spines.items():
         spine.set_visible(name == "right")
     # What is surest is told first.
-    _legend_below(ax, list(reversed(ax.get_lines())), 3)
+    legend_below(ax, list(reversed(ax.get_lines())), 3)
 
 
 def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     """All singular values of the FRFs at each line; found modes as vertical lines."""
     test, modes, label = _modes_of(subject)
     values, reason, unit = _indicator(test)
+    # Runs of other lengths have other lines: where they are alone, there is one singular value.
+    values = values[np.median(values, axis=1) > ROUND_OFF * values.max()]
     for curve, style in zip(values, _CURVES, strict=False):
         ax.plot(broken(test.freq, test.gaps), broken(positive(curve), test.gaps), zorder=3, **style)
     frequency_axis(ax, test.freq)
@@ -359,7 +363,7 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     if reason:
         _remark(ax, f"Singular values of the runs' own spectra: {reason}.")
     dress(ax, "Complex mode indicator function", "frequency [Hz]", f"singular value{unit}")
-    _legend_below(ax, ax.get_lines(), 4)
+    legend_below(ax, ax.get_lines(), 4)
 
 
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:
@@ -408,8 +412,9 @@ def _mode_lines(ax: Axes, modes: Array, label: str) -> None:
         ax.axvline(mode, **{**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5, "label": name})
 
 
-def _legend_below(ax: Axes, lines: Sequence[Line2D], columns: int) -> None:
-    handles = [line for line in lines if not str(line.get_label()).startswith("_")]
+def legend_below(ax: Axes, drawn: Sequence[Any], columns: int) -> None:
+    """Set the legend of what is drawn below the x axis, where it covers nothing."""
+    handles = [one for one in drawn if not str(one.get_label()).startswith("_")]
     ax.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.6, ncols=columns,
         frameon=False, fontsize="small", columnspacing=1.4, handlelength=1.6,

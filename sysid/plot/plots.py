@@ -33,6 +33,8 @@ from sysid.plot.panels import (
     draw_stabilisation,
     force_channel,
     key,
+    label_once,
+    legend_below,
     named_index,
     panels,
     place,
@@ -185,7 +187,7 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         elif high < 30 * low:
             plain_log(ax.yaxis)
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(frameon=False, fontsize="small")
+        legend_below(ax, ax.get_lines(), 2)
     else:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
     x_label = "iteration, swarm then local phase" if swarm.size else "iteration"
@@ -263,8 +265,8 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     ax.axhline(100, color=FAINT, linewidth=0.8, linestyle=":")
     ax.set_ylim(0, max(105.0, 1.05 * float(total.max())))
     count_modes(ax, structure.n)
-    ax.legend(frameon=False, fontsize="small", loc="center right")
     dress(ax, "Effective masses and their sum", "mode", "% of rigid-body mass")
+    legend_below(ax, ax.get_legend_handles_labels()[0], 4)
     return target
 
 
@@ -297,7 +299,7 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
 
 
 def mode_shapes(identification: Identification, modes: Sequence[int] | None = None) -> Figure:
-    """Mode shapes in space, one panel a mode: sticks join neighbouring sensors, grey at rest.
+    """Mode shapes in space, one panel a mode: sticks join the base and neighbouring sensors, grey at rest.
 
     Parameters
     ----------
@@ -314,7 +316,10 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
     InputError
         Where the sensors have no positions, or all the same.
     """
-    points, motion, sticks = stick_model(identification.measurement)
+    base = np.zeros((1, 3))  # to which its motion refers
+    points, motion, _ = stick_model(identification.measurement)
+    sticks = stick_model(identification.measurement, base)[2]
+    points, motion = np.vstack([base, points]), np.concatenate([np.zeros((1, *motion.shape[1:])), motion])
     structure = identification.structure
     columns = 6
     chosen = range(1, min(structure.n, columns) + 1) if modes is None else modes
@@ -353,7 +358,7 @@ def _set_box(ax: Any, centre: Array, box: Array) -> None:
         if size < 0.5 * box.max():
             getattr(ax, f"set_{name}ticks")([])  # no room for numbers
     ax.grid(False)
-    ax.set_box_aspect(box.tolist(), zoom=1.05)  # a list: an array would be scaled in place
+    ax.set_box_aspect(box.tolist(), zoom=0.95)  # a list: an array would be scaled in place
     ax.view_init(elev=20, azim=-50)
 
 
@@ -410,8 +415,8 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
     for column, (sensor, run) in enumerate(chosen):
         channel = response_channel(identification, test, sensor, run)
         draw(above[:, column], channel)
-    for ax in above[:, 1:].ravel():
-        ax.set_ylabel("")
+    for row in above:
+        label_once(row)
     above[0, 0].legend(handles=key(above[0]), frameon=False, fontsize="small")
     below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
     search = convergence if identification.history.swarm_curve.size else stabilisation

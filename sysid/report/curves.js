@@ -74,13 +74,14 @@ function ticksOf(low, high, count) {
   return ticks;
 }
 
-// Powers of ten, with their double and fivefold where there is room, some left out where there is not.
+// Powers of ten, with their double and fivefold or their threefold as there is room, some left out where there is not.
 function logTicks(low, high, room) {
   const decades = Math.log10(high / low);
   const every = Math.ceil(decades / room);
+  const factors = [[1, 2, 5], [1, 3]].find((some) => some.length * decades <= room) || [1];
   const found = [];
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power += 1) {
-    for (const k of 3 * decades <= room ? [1, 2, 5] : [1]) {
+    for (const k of factors) {
       const tick = k * 10 ** power;
       if (tick >= low && tick <= high && power % every === 0) found.push(tick);
     }
@@ -330,8 +331,8 @@ function drawMode(parent, data, mode, width, height) {
     return [width / 2 + size * x, (height + 30) / 2 + size * y];
   };
   const stick = (kind) => data.sticks.map(() => drawn(svg, "line", { class: kind }));
-  const [rest, moved] = [stick("rest"), stick("identified")];
-  const dots = data.points.map((_, p) => drawn(svg, "circle", { r: p ? 3 : 0, class: "dot" }));
+  const points = (kind) => data.points.map((_, p) => drawn(svg, "circle", { r: p ? 3 : 0, class: kind }));
+  const [rest, still, moved, dots] = [stick("rest"), points("place"), stick("identified"), points("dot")];
   const base = drawn(svg, "rect", { width: 44, height: 6, class: "base" });
   const named = drawn(svg, "text", {}, "base");
   data.names[mode].split(", ").forEach((words, at) => {
@@ -343,11 +344,13 @@ function drawMode(parent, data, mode, width, height) {
     put(one, { x1: start[0], y1: start[1], x2: end[0], y2: end[1] });
   });
   return (share, angle) => {
-    join(rest, data.points.map((point) => place(point, angle)));
+    const at = data.points.map((point) => place(point, angle));
+    join(rest, at);
+    still.forEach((dot, p) => put(dot, { cx: at[p][0], cy: at[p][1] }));
     const places = data.points.map((point, p) => place(point.map((v, i) => v + share * data.shapes[mode][p][i]), angle));
     join(moved, places);
     dots.forEach((dot, p) => put(dot, { cx: places[p][0], cy: places[p][1] }));
-    const [x, y] = place(data.points[0], angle);
+    const [x, y] = at[0];
     put(base, { x: x - 22, y: y - 3 });
     put(named, { x: x + 26, y: y + 5 });
   };

@@ -335,9 +335,10 @@ def mode_still(
     rest, moved = (_seen(where, size) for where in (points, points + shape))
     places = [[f"{x:.1f} {y:.1f}" for x, y in where] for where in (rest, moved)]
     joined = ["".join(f"M{at[i]}L{at[j]}" for i, j in sticks) for at in places]
-    at_rest = f'<path id="rest" class="rest" d="{joined[0]}"/>' if first else '<use href="#rest"/>'
-    lines = f'{at_rest}<path class="identified" d="{joined[1]}"/>'
-    dots = f'<path class="dots" d="{"".join(f"M{at}h0" for at in places[1][1:])}"/>'
+    still, dots = ("".join(f"M{one}h0" for one in at[1:]) for at in places)
+    at_rest = f'<g id="rest"><path class="rest" d="{joined[0]}"/><path class="places" d="{still}"/></g>'
+    lines = at_rest if first else '<use href="#rest"/>'
+    lines += f'<path class="identified" d="{joined[1]}"/><path class="dots" d="{dots}"/>'
     x, y = rest[0]
     base = f'<rect class="base" x="{x - 22:.1f}" y="{y - 3:.1f}" width="44" height="6"/>'
     base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'
@@ -345,7 +346,7 @@ def mode_still(
         f'<text{kind} x="{_MODE_WIDTH / 2:g}" y="{13 + 14 * at}" text-anchor="middle">{escaped(part)}</text>'
         for at, (part, kind) in enumerate(zip(name.split(", "), (' class="title"', "", ""), strict=False))
     )
-    return _svg(name, _MODE_WIDTH, _MODE_HEIGHT, lines + dots + base + words)
+    return _svg(name, _MODE_WIDTH, _MODE_HEIGHT, lines + base + words)
 
 
 def room_of_modes(points: Array, shapes: Array) -> float:
@@ -399,9 +400,9 @@ def _upward(panel: _Panel, bottom: float, top: float, margin: float = 1.3) -> _A
 
 
 def _log_ticks(low: float, high: float, room: float) -> list[float]:
-    """Powers of ten, with their double and fivefold where `room` has as many, some left out where it has not."""
+    """Powers of ten, with double and fivefold, or threefold, as there is `room`; some left out where there is not."""
     decades = np.log10(high / low)
-    factors = (1, 2, 5) if 3 * decades <= room else (1,)
+    factors = next((some for some in ((1, 2, 5), (1, 3)) if len(some) * decades <= room), (1,))
     every = int(np.ceil(decades / room))
     powers = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     numbers = (float(f"{k}e{int(power)}") for power in powers if power % every == 0 for k in factors)

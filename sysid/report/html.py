@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, NamedTuple
@@ -33,22 +34,28 @@ def escaped(value: object) -> str:
     return html.escape(shown_plainly(str(value)), quote=True)
 
 
+def prose(value: object) -> str:
+    """Escape a sentence; an option of a command, such as --leave-out, is not broken over two lines."""
+    return re.sub(r"--[a-z][a-z-]*", r'<span class="option">\g<0></span>', escaped(value))
+
+
 def number(value: float | None, digits: int = 4) -> str:
-    """Write a number with so many significant digits; a dash for what is not there."""
+    """Write a number with so many significant digits, up to a million without power of ten; a dash for none."""
     if value is None or not np.isfinite(value):
         return "–"
-    return f"{value + 0.0:.{digits}g}"  # a zero has no sign
+    return f"{float(f'{value + 0.0:.{digits}g}'):.{max(digits, 6)}g}"  # a zero has no sign
 
 
 def aligned(value: float | None) -> str:
     """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
     digits = number(value, 3)
-    return digits if "e" in digits or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
+    whole = "e" in digits or (len(digits) > 3 and "." not in digits)
+    return digits if whole or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
 def paragraph(value: object, kind: str = "") -> str:
     """Set a paragraph of plain text."""
-    return f"<p{_class(kind)}>{escaped(value)}</p>"
+    return f"<p{_class(kind)}>{prose(value)}</p>"
 
 
 def sentence(words: str) -> str:
@@ -58,7 +65,7 @@ def sentence(words: str) -> str:
 
 def bullets(sentences: Iterable[object]) -> str:
     """Set a list of plain sentences; nothing where there are none."""
-    items = "".join(f"<li>{escaped(s)}</li>" for s in sentences)
+    items = "".join(f"<li>{prose(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
 
 

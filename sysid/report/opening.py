@@ -11,12 +11,12 @@ from sysid.assessment.checks.context import noise_at_most
 from sysid.assessment.sensitivity import system_matrices
 from sysid.measurement.measurement import Measurement
 from sysid.plot.plots import normalised
-from sysid.report.html import bullets, escaped, heat_maps, matrix, no_lines, number, paragraph, sentence, table
+from sysid.report.html import bullets, escaped, heat_maps, matrix, no_lines, number, paragraph, prose, sentence, table
 from sysid.results.identification import Identification
 from sysid.results.summary import FIRST, JUDGEMENTS, fitted_in_words, next_steps, verdict
 from sysid.results.tables import counted, deck_masses, half_width, unknown_rows
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import LIKELY, ROUND_OFF
+from sysid.structure.thresholds import ROUND_OFF
 
 ONE_OF_MANY, CHOSEN = "one of many", "as the modal masses were chosen"
 _NO_FIT = "of a model that does not fit"
@@ -58,8 +58,9 @@ def matrix_tables(it: Identification) -> str:
     lower = list(map(half_widths, (M, K, C), stds))
     if label:
         lower[2] = no_lines(C.shape)  # half-widths about one choice tell less than its mark
-        words += _ENDS_ELSEWHERE if ends is None else _ENDS_BELOW
+        words += _ENDS_ELSEWHERE * (ends is None)
     if ends is not None:
+        words += _ENDS_BELOW
         lower[:2] = map(_ranges, (ends.mass, ends.stiffness), lower[:2])
     parts = [
         paragraph(words, "soft"),
@@ -108,10 +109,12 @@ def width_text(width: str) -> str:
 
 
 def _ranges(ends: Array, otherwise: Lines) -> Lines:
-    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
+    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they look alike."""
     lines = [list(line) for line in otherwise]
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])
+        if least == most != "–":
+            continue
         bounded = np.isfinite(ends[:, i, j])
         words_of = {
             (True, True): (f"{least} to", most),
@@ -142,7 +145,7 @@ def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
     against = bullets(sentence(str(one)) for one in it.contradictions[:FIRST])
-    judged = f"{paragraph(sentence(verdict(it)))}{against}<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
+    judged = f"{paragraph(sentence(verdict(it)))}{against}<p><b>Next:</b> {prose(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
     unknowns = unknown_rows(it)
     few = [(f"mass at {one.name}", one.mass, one.std, "kg") for one in deck_masses(it)]
@@ -245,8 +248,11 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
     width = half_width(std, value)
     if width in ("open", "0"):
         return number(value, digits), width
-    places = int(np.clip(1 - np.floor(np.log10(LIKELY * std)), 0, 9))
-    return f"{value + 0.0:.{places}f}", f"{LIKELY * std:.{places}f}"
+    half, largest = float(width), np.floor(np.log10(max(abs(value), float(width))))
+    places = 1 - int(np.floor(np.log10(half)))
+    if places > 9 or largest > 6:  # such as a compliance, or a large stiffness
+        return f"{value + 0.0:.{max(places + int(largest), 1)}e}", f"{half:.1e}"
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}", f"{half:.{max(places, 0)}f}"
 
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:

@@ -158,8 +158,7 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), width_text(tables.half_width(row.std, row.value)), row.unit,
-            number(row.lower), number(row.upper), row.on_bound,
+            row.label, *rounded(row.value, row.std, 6), row.unit, number(row.lower), number(row.upper), row.on_bound,
         )
         for row in tables.unknown_rows(it)
     ]  # fmt: skip
@@ -220,11 +219,18 @@ def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[ob
     """Effective masses of all modes and their sum, a column a base direction."""
     share, std = it.structure.effective_mass_percent, tables.mass_percent_std(it)
     for i, axis in enumerate(it.measurement.base_axes or ()):
-        below = [tuple(filter(None, (tables.known_half_width(value, 100.0, "±"),))) for value in std[:, i]]
+        below = [_below_percent(tables.half_width(value, 100.0)) for value in std[:, i]]
         cells = [
             Cell(f"{tables.tilde(one)}{v:.2f}", b) for v, one, b in zip(share[:, i], many[:, i], below, strict=True)
         ]
         yield [f"effective mass {axis} [%]", *cells, f"{tables.tilde(many[:, i])}{share[:, i].sum():.2f}"]
+
+
+def _below_percent(width: str) -> tuple[str, ...]:
+    """Line below a share that is told to 0.01 %: half of its 95 % interval, where that is known and not round-off."""
+    if width in ("open", "0"):
+        return ()
+    return (f"± {width_text(width)}" if float(width) >= 0.005 else "± <0.01",)
 
 
 def _rigid_body_mass(it: Identification) -> str:
@@ -288,12 +294,10 @@ def _gains(it: Identification) -> str:
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
     found = tables.gains_of_sensors(it)
-    priced = it.determined and any(np.isfinite(g.worth) for g in found)  # else M_SS has no deviation
+    priced = it.determined and any(g.worth > 0 for g in found)  # else M_SS has no deviation, or was stated
     caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
     head = ("sensor", "gain", "±", *["1 % moves M_SS by, deviations"] * priced)
-    rows = [
-        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), *[number(g.worth, 2)] * priced) for g in found
-    ]
+    rows = [(g.sensor, *rounded(g.gain, g.std), *[number(g.worth, 2)] * priced) for g in found]
     return table(head, rows, caption)
 
 

@@ -1,6 +1,7 @@
 """Pictures: they show the arrays that they say, need no display, and leave nothing open."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 
@@ -217,6 +218,39 @@ def test_effective_masses_are_shares_of_the_rigid_body_mass(unit, guess):
     np.testing.assert_allclose(ax.get_lines()[1].get_ydata(), np.cumsum(expected[1]))
 
 
+def test_no_legend_of_effective_masses_covers_them(unit):
+    figure = plot.effective_masses(unit)
+    to_png(figure)
+    (ax,) = figure.axes
+    legend = ax.get_legend().get_tightbbox()
+    assert legend.y0 >= 0 and legend.y1 < ax.get_window_extent().y0
+
+
+def test_mode_shapes_stand_on_the_base_and_no_label_is_cut(unit):
+    figure = plot.mode_shapes(unit)
+    to_png(figure)
+    for ax in figure.axes:
+        drawn = np.hstack([line.get_data_3d() for line in ax.get_lines()])
+        assert np.sum(np.all(drawn == 0, axis=0)) == 2  # at rest and moved
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+            seen = axis.label.get_window_extent()
+            assert min(seen.x0, seen.y0) >= 0 and seen.x1 <= figure.bbox.x1 and seen.y1 <= figure.bbox.y1
+
+
+def test_a_label_that_differs_from_its_neighbours_stands_in_a_gap_of_its_own(truth, guess):
+    base = np.einsum("rd,f->rdf", [[1.0, 0.1], [0.1, 1.0], [1.0, 0.2]], np.ones(FREQ.size, complex))
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(FREQ), base)
+    it = result(guess, sysid.Measurement(FREQ, base, response, rigid_body=truth.rigid_body, base_axes="xy"))
+    figure = plot.responses(it, 0)
+    to_png(figure)
+    phases = figure.axes[1::2]
+    assert [ax.get_ylabel() for ax in phases] == [f"phase to\nbase {axis} [°]" for axis in "xyx"]
+    for left, right in itertools.pairwise(phases):
+        assert right.yaxis.label.get_window_extent().x0 > left.get_window_extent().x1
+    shown = [ax.get_ylabel() for ax in plot.overview(it).subfigs[0].axes]
+    assert [label.count("phase") for label in shown].count(1) >= 2
+
+
 def test_mode_shapes_need_positions(unit, runs):
     figure = plot.mode_shapes(unit, [1, 3])
     assert [ax.get_title().split(":")[0] for ax in figure.axes] == ["mode 1", "mode 3"]
@@ -300,6 +334,14 @@ def test_the_cmif_of_more_than_six_runs_shows_six_singular_values():
     test = sysid.Measurement(FREQ, base, response, rigid_body=np.eye(2)[[0] * 8])
     expected = np.linalg.svd((response - 1.0).transpose(2, 0, 1), compute_uv=False)[:, 5]
     np.testing.assert_allclose(lines(plot.cmif(test).axes[0])["sixth"].get_ydata(), expected)
+
+
+def test_runs_alone_at_their_lines_have_one_singular_value(runs):
+    rng = np.random.default_rng(0)
+    records = [(rng.standard_normal((2, n)), rng.standard_normal((3, n)), None) for n in (400, 300)]
+    test = sysid.Measurement.from_time(records, 100.0, rigid_body=runs.measurement.rigid_body, band=(1.0, 10.0))
+    drawn = lines(plot.cmif(test).axes[0])
+    assert "first" in drawn and "second" not in drawn
 
 
 def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):

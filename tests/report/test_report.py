@@ -15,8 +15,8 @@ from scipy.stats import norm
 import sysid
 from sysid.finding import Finding, Severity
 from sysid.report import opening, report
-from sysid.report.html import aligned
-from sysid.report.opening import CHOSEN, ONE_OF_MANY, noise_of_test
+from sysid.report.html import aligned, number, paragraph
+from sysid.report.opening import CHOSEN, ONE_OF_MANY, _ranges, noise_of_test, rounded
 from sysid.results.summary import residual_in_words
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -149,7 +149,7 @@ def test_modes_and_their_reference_are_told(complete, page):
     assert f"{100 * (np.sqrt(1.02) - 1):+.2g}" in text
     for matrix in (ours.mass, ours.stiffness[:3, :3], ours.damping):
         for value in matrix.ravel():
-            assert f"{value:.4g}" in text
+            assert plain(value) in text
 
 
 def test_what_is_absent_leaves_no_section(plain, no_pictures):
@@ -225,8 +225,12 @@ def modal(truth):
     return identified
 
 
+def plain(value, digits=4):
+    return f"{float(f'{value + 0.0:.{digits}g}'):.6g}"  # 110, not 1.1e+02
+
+
 def half(std):
-    return f"{float(f'{norm.ppf(0.975) * std:.2g}'):.6g}"  # 110, not 1.1e+02
+    return plain(norm.ppf(0.975) * std, 2)
 
 
 def to_two_digits(value, std):
@@ -255,7 +259,7 @@ def test_what_is_determined_stands_with_half_of_its_95_percent_interval(modal, n
     M, K = s.mass[:3, :3], s.stiffness[:3, :3]
     for table, values, std in zip(square, (M, K, s.damping), (u.mass, u.stiffness, u.damping), strict=True):
         for name, row, own, wide in zip(names, table[1:], values, std, strict=True):
-            assert row == [name, *(f"{v:.4g}|± {half(w)}" for v, w in zip(own, wide, strict=True))]
+            assert row == [name, *(f"{plain(v)}|± {half(w)}" for v, w in zip(own, wide, strict=True))]
 
 
 def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, no_pictures):
@@ -273,7 +277,7 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
     assert len(square) == 3
     for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
         for i, j in np.ndindex(3, 3):
-            low, high = (f"{end + 0.0:.3g}" for end in ends[:, i, j])
+            low, high = (plain(end, 3) for end in ends[:, i, j])
             assert table[i + 1][j + 1].split("|")[1:] == [f"{low} to", high]
     assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
     assert page.words.count("one of many") == 6  # matrices and their heat maps; pictures are left out here
@@ -287,10 +291,43 @@ def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictur
 
 
 @pytest.mark.parametrize(
-    ("value", "told"), [(0.8961, "0.896"), (1.0, "1.00"), (123.4, "123"), (0.0, "0"), (1e-7, "1e-07"), (np.nan, "–")]
+    ("value", "told"),
+    [(0.8961, "0.896"), (1.0, "1.00"), (123.4, "123"), (0.0, "0"), (1e-7, "1e-07"), (1234.0, "1230"), (np.nan, "–")],
 )
 def test_numbers_of_a_column_keep_the_zeros_at_their_ends(value, told):
     assert aligned(value) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(6e5, "600000"), (561_712.0, "561700"), (-0.0, "0"), (1.234e7, "1.234e+07"), (2e-5, "2e-05")]
+)
+def test_a_number_has_a_power_of_ten_only_from_a_million_on(value, told):
+    assert number(value) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "told"),
+    [
+        (2471.384, 7.34, ("2471.4", "7.3")),
+        (900_446.2, 2251.0, ("900400", "2300")),
+        (1.27431e8, 3.1e5, ("1.2743e+08", "3.1e+05")),
+        (4.5678e-9, 1.2e-12, ("4.5678e-09", "1.2e-12")),
+        (-3e-4, 0.04, ("0.000", "0.040")),
+        (99.97, 0.996, ("100.0", "1.0")),
+    ],
+)
+def test_a_value_is_rounded_to_two_digits_of_its_interval(value, half, told):
+    assert rounded(value, half / norm.ppf(0.975)) == told
+
+
+def test_a_range_that_is_one_value_in_three_digits_is_left_to_its_interval():
+    otherwise = [[("± 0.1",), ("± 0.2",)], [("± 0.2",), ("± 0.3",)]]
+    ends = np.array([[[1.0, -2.0], [-2.0, 3.0]], [[1.0001, 2.0], [2.0, np.inf]]])
+    assert _ranges(ends, otherwise) == [[("± 0.1",), ("-2 to", "2")], [("-2 to", "2"), ("from 3",)]]
+
+
+def test_an_option_of_a_command_stays_on_one_line():
+    assert '<span class="option">--leave-out</span> run' in paragraph("'sysid refine RESULT --leave-out run'")
 
 
 def test_blocks_of_the_base_that_are_zero_are_a_line(written, no_pictures):

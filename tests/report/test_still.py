@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from sysid.report.curves import ChannelSpectra, curve_sheet, degrees
+from sysid.report.curves import _ABOVE, ChannelSpectra, _Axis, curve_sheet, degrees
 
 NUMBER = r"-?[\d.]+"
 
@@ -112,3 +112,13 @@ def test_no_curve_is_joined_where_lines_were_left_out():
     (gap,) = np.flatnonzero(np.isnan(size[:, 0]))
     across = scales(drawing)[0]
     np.testing.assert_allclose(across(size[[gap - 1, gap + 1], 0]), freq[24:26], rtol=0.01)
+
+
+@pytest.mark.parametrize("height", [68.0, 86.0])
+@pytest.mark.parametrize("decades", [1.0, 1.3, 1.8, 2.2, 3.0, 5.0])
+def test_an_axis_of_a_decade_has_two_numbers_wherever_it_begins(height, decades):
+    for low in np.geomspace(1e-3, 1e-2, 37):
+        axis = _Axis(low, low * 10**decades * 1.000001, height, 0.0, True)
+        ticks = axis.ticks(_ABOVE)
+        assert len(ticks) >= 2
+        assert np.min(np.abs(np.diff(axis(ticks)))) > 11.0  # the height of a number
