@@ -105,8 +105,7 @@ def force_misfit(formulation: Formulation, test: Measurement, structure: Structu
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
-    velocity = not structure.modal_damping
-    possible = max(force_residual_left(test, *distinct_poles(structure), velocity=velocity), EXACT)
+    possible = max(force_residual_left(test, *distinct_poles(structure), velocity=not structure.modal_damping), EXACT)
     if misfit > max(MISFIT * possible, NEGLIGIBLE):
         yield Finding(
             "force misfit", Severity.CONTRADICTS,
