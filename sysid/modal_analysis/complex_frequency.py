@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, force_residues
 from sysid.modal_analysis.response import columns, gains_with_velocity, weights_of
-from sysid.modal_analysis.vector_fitting import poles_of_any_damping
-from sysid.problem.prepared import Monitor
+from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray
 
 _LEAST = 1e-5  # least level of noise; a smaller one would leave priors no weight

@@ -47,8 +47,7 @@ from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.misfit import SUSPECT
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains
-from sysid.modal_analysis.vector_fitting import poles_from, poles_of_any_damping
-from sysid.problem.prepared import Monitor
+from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 

@@ -22,7 +22,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.response import gains, stacked
-from sysid.problem.stored import BESIDE
+from sysid.modal_analysis.vector_fitting import BESIDE
 from sysid.structure.structure import Array, ComplexArray
 
 LEVELS = ("new", "frequency", "frequency, damping", "frequency, damping, shape")  # what is stable
