@@ -155,9 +155,7 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     terms = slice(first - direct.shape[1], first)
     freedom = max(len(left) - count, 1)
     level = np.maximum(np.linalg.norm(left, axis=0), ROUND_OFF * np.linalg.norm(records.data, axis=0))
-    lowest = records.freq[records.freq > 0][0]
-    tail = np.divide(lowest, records.freq, out=np.zeros_like(records.freq), where=records.freq > 0) ** 2
-    tail = records.basis(tail[None] + 0j, records.driven)
+    tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
     beyond = np.linalg.qr(tail - basis.times(basis.answers(tail)))[0]
     noise = records.noise(left, count * left.shape[1])
     gained = float(np.sum((beyond.T @ left) ** 2))

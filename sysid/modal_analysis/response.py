@@ -200,11 +200,6 @@ def gains_and_slopes(freq: Array, omega: Array, ratios: Array) -> tuple[ComplexA
     return g, np.concatenate([by * (2 * (omega**2)[:, None] + loss), by * loss])
 
 
-def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
-    """Derivatives of `gains` by log w_k, then by log zeta_k, (2m, n_freq)."""
-    return gains_and_slopes(freq, omega, ratios)[1]
-
-
 def motion_and_slopes(
     freq: Array, omega: Array, ratios: Array, gamma: Array, base: ComplexArray, ends: ComplexArray | float = 0.0
 ) -> ComplexArray:

@@ -18,7 +18,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
-from sysid.modal_analysis.response import gain_slopes, gains
+from sysid.modal_analysis.response import gains_and_slopes
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance, round_off
@@ -387,12 +387,9 @@ def _projected(records: Records, p: Array, fit: ResidueFit, velocity: bool) -> t
     """Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at the `fit` on log poles `p`."""
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])
-    by_pole = gain_slopes(records.freq, omega, ratios)[:, None]
-    if velocity:
-        turn = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None]
-        moved = np.concatenate([gains(records.freq, omega, ratios), np.zeros((m, records.freq.size))])
-        by_pole = np.concatenate([by_pole, (turn * (by_pole[:, 0] - moved))[:, None]], axis=1)
-    slopes = records.of_poles([by_pole[:, i] for i in range(by_pole.shape[1])])
+    g, by_pole = gains_and_slopes(records.freq, omega, ratios)
+    turned = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None] * (by_pole - np.concatenate([g, np.zeros_like(g)]))
+    slopes = records.of_poles([by_pole, turned][: 1 + velocity])
     beside, products = fit.beside(slopes)
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.size, -1)
     d = slopes.per_pole

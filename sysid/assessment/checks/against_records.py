@@ -329,9 +329,8 @@ def _mac(structure: Structure, i: int, j: int) -> float:
 def _missed(test: Measurement, structure: Structure, frequency: float, width: float) -> str | None:
     """Misfit of a fit about a peak, in words; None where that is no more than elsewhere.
 
-    Noise as large at all lines is more of a weak mode's response than of others, but no larger there; noise in
-    proportion to the response is larger at a peak, but no more of it. Only a peak itself that is not what modes make of
-    it stands out both ways.
+    Noise as large at all lines is more of a weak mode's response, but no larger there; noise in proportion to the
+    response is no more of it. Only a peak itself that is not what modes make of it stands out both ways.
     """
     distance = np.gradient(test.freq)
     near = np.abs(test.freq - frequency) < _NEAR * np.maximum(width, distance)

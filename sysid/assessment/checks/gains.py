@@ -20,7 +20,7 @@ from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
-from sysid.modal_analysis.response import gain_slopes
+from sysid.modal_analysis.response import gains_and_slopes
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
@@ -95,7 +95,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     free = records.fit(*poles, velocity=velocity)
     rise = (test.freq / test.freq[-1]) ** 2
     ones, rising = (records.basis(part[None] + 0j) for part in (np.ones_like(rise), rise))
-    slopes = records.basis(gain_slopes(test.freq, *poles)[: 0 if velocity else None])
+    slopes = records.basis(gains_and_slopes(test.freq, *poles)[1][: 0 if velocity else None])
     plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
     error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
@@ -120,11 +120,9 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
         zero, one = np.zeros((omega.size, omega.size)), np.eye(omega.size)
         damping = structure.normal_modes.T @ structure.damping @ structure.normal_modes
         s = np.linalg.eigvals(np.block([[zero, one], [-np.diag(omega**2), -damping]]))
-        # Real ones in twos, any two of which make the same functions of frequency.
-        pairs = np.array([*zip(s[s.imag > 0], s[s.imag < 0], strict=True), *np.sort(s[s.imag == 0]).reshape(-1, 2)])
-        pairs = pairs[np.argsort(np.prod(pairs, axis=1).real)]
-        omega = np.sqrt(np.prod(pairs, axis=1).real)
-        ratios = -pairs.sum(axis=1).real / (2 * omega)
+        fast, slow = np.sort(s[s.imag == 0].real).reshape(-1, 2).T  # any two real ones make the same functions
+        omega = np.concatenate([np.abs(s[s.imag > 0]), np.sqrt(fast * slow)])
+        ratios = -np.concatenate([s[s.imag > 0].real, (fast + slow) / 2]) / omega
     poles = omega * (1 + 1j * ratios)
     first = ~np.triu(np.abs(poles[:, None] - poles) <= NEGLIGIBLE * omega, 1).any(axis=0)
     return omega[first], ratios[first]
