@@ -165,15 +165,14 @@ def panels(channels: Sequence[PlottedChannel], *, alone: float = 6.4) -> Figure:
         blocks, columns, left=left / width, right=1 - 0.12 / width, bottom=0.75 / height, top=1 - 0.3 / height,
         wspace=0.24 if len({(one.quantity, one.phase) for one in channels}) == 1 else 0.36, hspace=0.3,
     )  # fmt: skip
-    drawn: list[Any] = []
     for at, channel in enumerate(channels):
         axes: Any = grid[divmod(at, columns)].subgridspec(2, 1, height_ratios=[2.2, 1], hspace=0.12).subplots()
         draw(axes, channel)
         axes[0].yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
-        drawn.append(axes)
-    for first in range(0, len(drawn), columns):
-        for row in zip(*drawn[first : first + columns], strict=True):
-            label_once(row)
+    for first in range(0, len(figure.axes), 2 * columns):
+        row = figure.axes[first : first + 2 * columns]
+        label_once(row[::2])
+        label_once(row[1::2])
     figure.legend(handles=key(figure.axes), loc="lower center", ncols=5, frameon=False, fontsize="small")
     return figure
 

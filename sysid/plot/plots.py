@@ -316,10 +316,7 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
     InputError
         Where the sensors have no positions, or all the same.
     """
-    base = np.zeros((1, 3))  # to which its motion refers
-    points, motion, _ = stick_model(identification.measurement)
-    sticks = stick_model(identification.measurement, base)[2]
-    points, motion = np.vstack([base, points]), np.concatenate([np.zeros((1, *motion.shape[1:])), motion])
+    points, motion, sticks = stick_model(identification.measurement)
     structure = identification.structure
     columns = 6
     chosen = range(1, min(structure.n, columns) + 1) if modes is None else modes
@@ -441,12 +438,10 @@ def normalised(matrix: Array) -> Array:
     return np.divide(matrix, outer, out=np.zeros_like(outer), where=outer > 0)
 
 
-def stick_model(
-    test: Measurement, further: Sequence[ArrayLike] | Array = ()
-) -> tuple[Array, Array, list[tuple[int, int]]]:
-    """Points of the sensors (p, 3), their motion by each sensor (p, 3, n_sensors), and pairs that a stick joins.
+def stick_model(test: Measurement) -> tuple[Array, Array, list[tuple[int, int]]]:
+    """The base and the sensors (p, 3), their motion by each sensor (p, 3, n_sensors), and pairs that a stick joins.
 
-    In the pairs `further` points (q, 3) count first. Refused where the sensors have no positions, or all the same.
+    The base comes first, at the origin. Refused where the sensors have no positions, or all the same.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform
@@ -456,9 +451,9 @@ def stick_model(
         raise InputError("mode_shapes: the sensors are not described; give the measurement sysid.Sensor objects")
     points, owner = np.unique(np.array([s.position for s in sensors], float).round(9), axis=0, return_inverse=True)
     refuse((len(points) < 2, "mode_shapes: all sensors are described at one place; positions are needed"))
-    motion = np.zeros((len(points), 3, len(sensors)))
+    motion = np.zeros((1 + len(points), 3, len(sensors)))
     for s, (sensor, p) in enumerate(zip(sensors, np.ravel(owner), strict=True)):
-        motion[p, :, s] = axis_vector(sensor.axis)
-    every = np.vstack([*further, points])
-    tree = minimum_spanning_tree(squareform(pdist(every))).tocoo()
+        motion[1 + p, :, s] = axis_vector(sensor.axis)
+    points = np.vstack([np.zeros(3), points])
+    tree = minimum_spanning_tree(squareform(pdist(points))).tocoo()
     return points, motion, list(zip(tree.row.tolist(), tree.col.tolist(), strict=True))

@@ -80,20 +80,17 @@ def _legend(channels: Sequence[ChannelSpectra], at_most: bool) -> str:
 def mode_shape_view(it: Identification) -> str:
     """Element of the mode shapes in space; nothing where the sensors have no positions."""
     try:
-        points, motion, _ = stick_model(it.measurement)
+        model = stick_model(it.measurement)
     except InputError:
         return ""
-    content = _modes(it, points, motion)
+    content = _modes(it, *model)
     return _element("modes", content, "Mode shapes, with the base at rest", _mode_stills(content))
 
 
-def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
-    base = np.zeros((1, 3))  # to which the motion of the base refers
-    points = np.vstack([base, points])
-    sticks = stick_model(it.measurement, base)[2]
+def _modes(it: Identification, points: Array, motion: Array, sticks: Sequence[tuple[int, int]]) -> dict[str, Any]:
     shapes = []
     for k in range(it.structure.n):
-        shape = np.vstack([np.zeros((1, 3)), motion @ it.structure.mode_shapes[:, k]])
+        shape = motion @ it.structure.mode_shapes[:, k]
         # The largest motion is a share of the structure's size.
         shape *= 0.18 * np.ptp(points, axis=0).max() / np.abs(shape).max()
         shapes.append(shape.round(6).tolist())
