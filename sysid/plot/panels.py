@@ -181,8 +181,7 @@ def label_once(row: Sequence[Axes]) -> None:
     """Keep of axes beside each other the labels upwards that differ from the one before."""
     labels = [ax.get_ylabel() for ax in row]
     for ax, before, label in zip(row[1:], labels, labels[1:], strict=False):
-        if label == before:
-            ax.set_ylabel("")
+        ax.set_ylabel(label * (label != before))
 
 
 def key(axes: Iterable[Axes]) -> list[Any]:
