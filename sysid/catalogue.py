@@ -190,8 +190,8 @@ def _in_folder(folder: Path, name: str) -> Path | None:
 def _load(name: str) -> tuple[ModuleType, Path]:
     """Import a problem module; also the path that messages call it by."""
     file = file_of(name)
-    if file is not None:
-        return _load_file(file)
+    if file is not None or os.path.isfile(name):  # noqa: PTH113 - a name may be too long for a path
+        return _load_file(file or Path(name))
     parts = name.split(".")
     if len(parts) > 1 and all(part.isidentifier() for part in parts):
         return _load_dotted(name)
@@ -202,12 +202,13 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
     try:
         other = (
-            f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
-            "'sysid run TEST.h5'"
+            f"problem {path}: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes a test "
+            "of a logger's file, and 'sysid run TEST.h5' runs it"
         )
+        hint = "; 'sysid show' tells of a result" * (path / "result.h5").is_file()
         refuse(
             # A device, or a pipe, may never end; a test or a result that somebody else made may hold Python.
-            (path.exists() and not path.is_file(), f"problem {path} is not a file"),
+            (path.exists() and not path.is_file(), f"problem {path} is not a file{hint}"),
             (path.exists() and path.suffix != ".py", other),
         )
         source = path.read_bytes()

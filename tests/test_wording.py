@@ -34,12 +34,12 @@ from sysid.cli import doctor, refine, requests
 from sysid.cli import main as cli
 from sysid.cli.output import Output, alone_in, results_folder
 from sysid.compare.comparison import Comparison, comparison_text
-from sysid.files import reading
+from sysid.files import description, reading
 from sysid.files.assembly import work_of_force
 from sysid.finding import Finding, Severity
 from sysid.jobs import JobResult
 from sysid.nlp import time_too_short
-from sysid.report import report
+from sysid.report import html, report
 from sysid.results.checkpoint import Checkpoint, RunRequest
 from sysid.results.storage import atomically
 from sysid.results.summary import next_steps, verdict
@@ -167,14 +167,28 @@ REFUSED = {
     "a folder for a module": (
         lambda: (Path("folder.py").mkdir(), catalogue.build(Recipe("folder.py"))), "problem folder.py is not a file",
     ),
+    "a folder of a result for a module": (
+        lambda: (Path("kept").mkdir(), Path("kept/result.h5").touch(), catalogue.build(Recipe("kept/"))),
+        "problem kept is not a file; 'sysid show' tells of a result",
+    ),
+    "a table for a module": (
+        lambda: (Path("log.csv").touch(), catalogue.build(Recipe("log.csv"))),
+        "problem log.csv: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes a test "
+        "of a logger's file, and 'sysid run TEST.h5' runs it",
+    ),
+    "sensors in single brackets": (
+        lambda: (Path("s.toml").write_text("[sensor]\nname='a'\n[sensor]"), description.from_toml(Path("s.toml"))),
+        "s.toml is no TOML: Cannot declare ('sensor',) twice (at line 3, column 8); a sensor begins with [[sensor]], "
+        "in two brackets",
+    ),
     "no module": (
         lambda: catalogue.build(Recipe("nowhere.py")),
         f"problem nowhere.py cannot be read: {os.strerror(errno.ENOENT)}",
     ),
     "a test for a module": (
         lambda: catalogue.build(Recipe("./test.h5")),
-        "problem test.h5: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
-        "'sysid run TEST.h5'",
+        "problem test.h5: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes "
+        "a test of a logger's file, and 'sysid run TEST.h5' runs it",
     ),
     "no data": (
         lambda: catalogue.build(Recipe("idle.py", "nowhere")),
@@ -269,6 +283,12 @@ def test_what_is_refused_is_told_with_the_place_and_the_remedy(here, tmp_path, n
     assert str(refused.value) == sentence.format(here=tmp_path, host=socket.gethostname())
 
 
+def test_a_sentence_begins_with_a_capital_but_a_channel_keeps_its_name():
+    assert html.sentence("half-open data, at rest") == "Half-open data, at rest."
+    assert html.sentence("x5 reads 2 % low") == "x5 reads 2 % low."
+    assert html.sentence("mTop reads 2 % low!") == "mTop reads 2 % low!"
+
+
 ENDED = {
     "search": "interrupted; the best so far is in results/shear_building",
     "pages": "interrupted while saving; the result is there, but not every file is in results/shear_building",
@@ -349,14 +369,14 @@ FOUND = [
     (
         "gain", "gain",
         lambda of: f"sensor 2 reads 2 % high against the base (standard deviation {100 * of['std']:.1g} %): M_SS, K_SS "
-        "and C are wrong in its row and column; calibrate it and divide its record by 1.0200, or correct its row of "
-        "rigid_body",
+        "and C are wrong in its row and column; calibrate it and divide its record by 1.0200 (gain = 1.0200 in "
+        "sensors.toml), or correct its axis or its row of rigid_body",
     ),
     (
         "low gain", "gain",
         lambda of: f"sensor 2 reads 0.44 % low against the base (standard deviation {100 * of['std']:.1g} %): M_SS, "
-        "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956, or correct its row "
-        "of rigid_body",
+        "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956 (gain = 0.9956 in "
+        "sensors.toml), or correct its axis or its row of rigid_body",
     ),
     ("goal", "goal", lambda of: f"the residual {of['residual']:.3g} is above the goal 0.0001"),
     (

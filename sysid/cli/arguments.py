@@ -106,8 +106,8 @@ def _add_show(command: Adder) -> None:
         summary="tell the unknowns of a problem and what its data determine, without a search",
         description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
         "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess. Of a result.h5 "
-        "its summary, of a test that 'sysid read' wrote its channels.",
-        examples=("sysid show shear_building", "sysid show my_building.py"),
+        "or its folder the summary, of a test that 'sysid read' wrote the channels.",
+        examples=("sysid show shear_building", "sysid show my_building.py", "sysid show results/cantilever_tower"),
     )
     _add_problem(show)
     show.add_argument(
@@ -235,7 +235,7 @@ def _add_read(command: Adder) -> None:
         nargs="+",
         default=[],
         metavar=("COLUMN", "KEY=VALUE"),
-        help="one sensor: role=base|response|force axis=x position=0,0,3 unit=g name=NAME",
+        help="one sensor: role=base|response|force axis=x position=0,0,3 unit=g gain=0.995 name=NAME",
     )
     read.add_argument("--rate", type=float, metavar="HZ", help="samples a second, where no column has the time")
     read.add_argument("--time", metavar="COLUMN", help="the column of time")

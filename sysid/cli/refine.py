@@ -163,9 +163,8 @@ def _recipe(result: Identification, options: argparse.Namespace, source: Path, o
 def _started(recipe: Recipe, source: Path) -> Recipe:
     """The recipe, where it has a start."""
     if recipe.start is None:
-        raise InputError(
-            f"{source}: its degrees of freedom are not the sensors, so it has no unknowns of the problem to start from"
-        )
+        why = "its degrees of freedom are not the sensors, so it has no unknowns to start from"
+        raise InputError(f"{source}: {why}; --leave-out, --bands and --orders need none")
     return recipe
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ from sysid.problem.direct_response import Slopes, slopes_of
 from sysid.problem.prepared import HELD, LOOSE, Prepared, points_of
 from sysid.problem.problem import Problem
 from sysid.results.identification import load
+from sysid.results.storage import FILE_NAME
 from sysid.results.summary import WIDTH
 from sysid.results.tables import counted, in_columns
 from sysid.search.auto import choose
@@ -46,9 +48,10 @@ _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequ
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
-    """Tell of a problem; of a stored result its summary, of a test that ``sysid read`` wrote its channels."""
+    """Tell of a problem; of a result or its folder the summary, of a test that ``sysid read`` wrote the channels."""
     file = options.problem
-    if not is_test(file):
+    folder = not catalogue.is_bundled(file) and os.path.isfile(f"{file}/{FILE_NAME}")  # noqa: PTH113 - as a long name
+    if not (folder or is_test(file)):
         recipe = recipe_of(options, out, options.seed)
         problem = catalogue.build(recipe)
         if out.json:
@@ -58,7 +61,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
         return SUCCESS
     of_problems = options.settings or options.data or options.seed is not None
     refuse((of_problems, f"{file}: --set, --data and --seed are for problems"))
-    if recorded_test.is_recorded_test(file):
+    if not folder and recorded_test.is_recorded_test(file):
         tell_channels(recorded_test.load(file), out)
     else:
         result = load(file)

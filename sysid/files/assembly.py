@@ -196,7 +196,7 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
         (units.find(column.unit) not in (None, known), f"{place}: {unlike} the description"),
         (known.quantity != wanted, f"{place}: {words}{'; sysid takes accelerations in time' * (not force)}"),
     )
-    return known.factor, text
+    return known.factor / channel.gain, text
 
 
 def run_of(

@@ -12,7 +12,7 @@ from sysid.errors import InputError, as_float, choice, flag, path_of, printable,
 from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
-_FIELDS = ("column", "name", "role", "position", "axis", "unit", "reference")
+_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "reference")
 _TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
@@ -34,7 +34,7 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """Description of one column; `axis` and `position` are None where the file has to tell them."""
+    """Description of one column, which is divided by `gain`; `axis`, `position` are None where the file tells them."""
 
     column: str | int
     role: str
@@ -43,6 +43,7 @@ class Channel:
     position: tuple[float, float, float] | None
     unit: str
     reference: str
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,8 @@ def from_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:  # of tomllib, of what is no text, of numbers of 5,000 digits
-        raise InputError(f"{path} is no TOML: {error}") from None
+        twice = "; a sensor begins with [[sensor]], in two brackets" if "('sensor',)" in str(error) else ""
+        raise InputError(f"{path} is no TOML: {error}{twice}") from None
 
 
 def from_words(words: Sequence[str]) -> dict[str, Any]:
@@ -93,16 +95,15 @@ def from_words(words: Sequence[str]) -> dict[str, Any]:
     entry: dict[str, Any] = {"column": words[0]}
     for word in words[1:]:
         name, equals, value = word.partition("=")
-        if not equals or name not in _FIELDS[1:]:
-            raise InputError(
-                f"--sensor {words[0]}: {word!r} is none of {', '.join(f'{one}=' for one in _FIELDS[1:])}; such as "
-                "--sensor CH2 role=response axis=x position=0,0,3 unit=g"
-            )
-        listed = name == "position" or (name == "axis" and "," in value)
+        known = " ".join(f"{one}=" for one in _FIELDS[1:])
+        wrong = not equals or name not in _FIELDS[1:]
+        refuse((wrong, f"--sensor {words[0]}: {word!r} is none of {known}; such as role=response position=0,0,3"))
+        alone, listed = name == "gain", name == "position" or (name == "axis" and "," in value)
         try:
-            entry[name] = [float(part) for part in value.split(",")] if listed else value
+            entry[name] = float(value) if alone else [float(one) for one in value.split(",")] if listed else value
         except ValueError:
-            raise InputError(f"--sensor {words[0]}: {word!r} needs numbers, such as {name}=0,0,3") from None
+            such = "a number, such as gain=0.995" if alone else f"numbers, such as {name}=0,0,3"
+            raise InputError(f"--sensor {words[0]}: {word!r} needs {such}") from None
     return entry
 
 
@@ -149,15 +150,17 @@ def _channel(entry: Any, place: str) -> Channel:
     column: Any = entry.get("column")
     refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
     place = f"{place} (column {printable(f'{place}: column', str(column))})"
-    choice(f"{place}: role", entry.get("role"), ROLES)
+    refuse(("role" not in entry, f"{place}: role is missing; give one of {str(ROLES)[1:-1]}"))
+    choice(f"{place}: role", entry["role"], ROLES)
     axis, where = entry.get("axis"), entry.get("position")
     if axis is not None:
         sensor_row(axis, place)
         axis = axis if isinstance(axis, str) else tuple(map(float, axis))
     x, y, z = vector3((0.0, 0.0, 0.0) if where is None else where, f"{place}: position").tolist()
     name = text(f"{place}: name", entry.get("name", str(column)))
-    words = [printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference")]
-    return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), *words)
+    unit, reference = (printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference"))
+    gain = as_float(f"{place}: gain", entry.get("gain", 1.0), "a positive number, such as 0.995,", above=0)
+    return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), unit, reference, gain)
 
 
 def description_file(path: Path) -> Path | None:

@@ -171,12 +171,12 @@ def _form(recording: Recording, column: Column, channel: Channel, said: Descript
     place = f"{recording.path}, {column.place}"
     text = channel.unit or column.unit
     if not text and said.frf == "transmissibility" and channel.role != "force":
-        return _Form(1.0, "", "", "1")
+        return _Form(1 / channel.gain, "", "", "1")
     unsaid = f"no unit{' and no form' * (said.frf == '')} is stated: is it receptance, mobility, accelerance or"
     state = 'State frf = "..." (--frf) and unit = "m/s² / N" or the like'
     refuse((not text, f"{place}: of this function {unsaid} transmissibility? {state}"))
     upper, lower = units.ratio(text, place)
-    form = _Form(upper.factor / lower.factor, upper.quantity, lower.quantity, text)
+    form = _Form(upper.factor / lower.factor / channel.gain, upper.quantity, lower.quantity, text)
     known = f"frf = {said.frf!r}" * bool(said.frf) or "no frf (transmissibility, of motions)"
     gives = f"a {channel.role} sensor gives {_OF_ROLE[channel.role]} per unit of the reference"
     words = f"the unit {text!r} does not fit: {known} is stated, and {gives}: mend frf (--frf), or the unit"

@@ -59,8 +59,10 @@ def paragraph(value: object, kind: str = "") -> str:
 
 
 def sentence(words: str) -> str:
-    """Begin with a capital, end with a stop."""
-    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
+    """Begin with a capital, end with a stop; a first word with digits or capitals, as of a channel, stays as it is."""
+    first = words.partition(" ")[0]
+    capital = words[:1].upper() if first.islower() and not set("_0123456789") & set(first) else words[:1]
+    return capital + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
 
 
 def bullets(sentences: Iterable[object]) -> str:

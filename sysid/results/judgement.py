@@ -35,8 +35,8 @@ from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _NOT_JUDGED = Finding(
     "not judged", Severity.CAUTION,
-    "what data and model determine, and how far noise leaves it known, was not judged: the time was over",
-    "give it more time (--max-time, max_time=)",
+    "what data and model determine, and how far noise leaves it known, was not judged: the time or Ctrl-C ended it",
+    "let it end, or give it more time (--max-time, max_time=)",
 )  # fmt: skip
 
 

@@ -120,7 +120,7 @@ def verdict(it: Answer) -> str:
         case "doubtful":
             return "a fit, but something speaks against this model, so that its matrices may be wrong"
     if it.of_kind("not judged"):
-        return "as far as was judged until the time was over"
+        return "as far as was judged before Ctrl-C or the end of the time"
     if it.hurried or it.is_one_of_many:
         return "other models explain the data as well"
     return "some entries of the matrices are not known well enough"

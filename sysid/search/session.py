@@ -350,7 +350,7 @@ class Session:
     def _check_limits(self) -> None:
         self.interrupt.check()
         if self.is_over:
-            raise Stop("the time was over before the modes of the records were found")
+            raise Stop("the time was over before the modes of the records were found (give more by --max-time)")
 
     def finish(self, seconds: float = 1.0) -> None:
         """Leave so many seconds to what is still to be done, where Ctrl-C or a callback ended the fit of modes."""

@@ -170,6 +170,8 @@ def test_show_prints_the_summary_of_a_result_and_the_channels_of_a_test(here, fi
     result, file = sysid.load(finished), finished / "result.h5"
     assert cli.main(["show", str(file)]) == 0
     assert capsys.readouterr().out == f"{result.summary()}\n"
+    assert cli.main(["show", str(finished)]) == 0
+    assert capsys.readouterr().out == f"{result.summary()}\n"
     assert document("show", file)[1]["result"]["residual"] == pytest.approx(result.residual)
     assert document("show", file, "--set", "floors=3")[0] == 2
     columns = np.column_stack([np.arange(200) / 50, np.random.default_rng(0).standard_normal((200, 2))])

@@ -93,6 +93,7 @@ def test_units_in_brackets_and_a_cut_last_row(tmp_path):
         (lambda rows: [row.replace("top", "roof") for row in rows], SENSORS, "no column 'top': it has 4 columns"),
         (lambda rows: [row.replace("Zeit", "n") for row in rows], SENSORS, "no column of time.*sample_rate"),
         (lambda rows: rows, {"sensor": [{"column": "top", "role": "response"}]}, "sensor 1 .*axis is missing"),
+        (lambda rows: rows, {"sensor": [{"column": "top", "axis": "x"}]}, "sensor 1 .*role is missing; give one of"),
     ],
 )
 def test_a_broken_table_is_told_in_words(tmp_path, change, said, words):
@@ -244,6 +245,33 @@ def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
     assert cli.main(["run", "cantilever_tower", "--goal", "0.1"]) == 2
     error = capsys.readouterr().err
     assert "--goal " in error and "'sysid read'" in error
+
+
+def test_a_stated_gain_divides_its_channel_in_records_and_spectra(tmp_path):
+    (tmp_path / "run.csv").write_text("\n".join(table()))
+    gains = (1.25, 0.8, 1.1)
+    stated = [{**one, "gain": gain} for one, gain in zip(SENSORS["sensor"], gains, strict=True)]
+    test = reading.gather(tmp_path / "run.csv", {"sensor": stated})
+    np.testing.assert_allclose(np.vstack(test.runs[0]), records()[2] / np.array(gains)[:, None], rtol=1e-10)
+    np.savez(tmp_path / "a.npz", freq=FREQ, H=H, F=F)
+    stated = [{**one, "gain": 0.8} if one["column"] in ("H[2]", "F") else one for one in MATRIX["sensor"]]
+    test, plain = (sysid.read(tmp_path / "a.npz", {**MATRIX, "sensor": one}) for one in (stated, MATRIX["sensor"]))
+    np.testing.assert_allclose(test.response, plain.response / [[1], [0.8], [1]], rtol=1e-12)
+    np.testing.assert_allclose(test.force, plain.force / 0.8, rtol=1e-12)
+
+
+def test_a_gain_is_stated_at_the_command_line_too(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.csv").write_text("\n".join(table()))
+    base, top = ["--sensor", "table", "role=base", "axis=x"], ["--sensor", "top", "role=response", "axis=x"]
+    words = ["read", "run.csv", *base, *top]
+    assert cli.main([*words, "gain=0.8"]) == 0
+    np.testing.assert_allclose(recorded_test.load("test.h5").runs[0][1][0], records()[2][1] / 0.8, rtol=1e-10)
+    for wrong in ("gain=0", "gain=low"):
+        capsys.readouterr()
+        assert cli.main([*words, wrong]) == 2
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and "gain" in told and "0.995" in told
 
 
 def test_a_file_without_sensors_points_to_the_help_in_one_line(tmp_path, monkeypatch, capsys):

@@ -139,8 +139,8 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
             "gain", Severity.CONTRADICTS,
             f"{name} reads {100 * abs(error):.2g} % {'high' if error > 0 else 'low'} against the base (standard "
             f"deviation {100 * errors.std[i]:.1g} %){alike}: M_SS, K_SS and C are wrong in its row and column",
-            f"calibrate it and divide its record by {1 + error:.4f}, or correct its row of rigid_body", channel=name,
-            numbers=numbers,
+            f"calibrate it and divide its record by {1 + error:.4f} (gain = {1 + error:.4f} in sensors.toml), or "
+            "correct its axis or its row of rigid_body", channel=name, numbers=numbers,
         )  # fmt: skip
 
 
