@@ -28,9 +28,9 @@ CEILINGS = {
     # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340),
     # and fits that end when they are asked to, with the best so far, which results hold (400),
     # and transients of runs eliminated run by run, noise levels and further modes of low rank (210).
-    "lines": 39_858,
+    "lines": 39_884,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 76.5,
+    "branches": 76.6,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
