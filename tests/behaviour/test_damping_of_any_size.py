@@ -94,12 +94,15 @@ def test_a_spring_on_its_bound_is_told_first_and_accuses_nothing_else():
 
 
 def test_a_wrong_mass_is_accused_beside_a_damper_that_rests_on_zero():
-    """The damper makes up for what the mass spoils, and explains little of it."""
+    """The damper makes up for what the mass spoils, and explains little of it.
+
+    Where the mass is a quarter to a third too large the last bits decide whether IPOPT ends before its limit.
+    """
     test, _ = shaken(np.array([0.01, 0.012, 0.015]))
     k = sysid.Variable("spring", N, lower=400.0, upper=40000.0, log=True)
     c = sysid.Variable("damper", N, lower=0.0, upper=100.0)
     written = {"stiffness": STRETCH.T @ ca.diag(k) @ STRETCH, "damping": STRETCH.T @ ca.diag(c) @ STRETCH}
-    result = sysid.identify(sysid.Problem(test, mass=np.diag(MASSES * [1, 1.3, 1]), **written), rng=0)
+    result = sysid.identify(sysid.Problem(test, mass=np.diag(MASSES * [1, 1.35, 1]), **written), rng=0)
     assert not result.of_kind("bounds")
     assert result.of_kind("misfit", severity="contradicts")
 
