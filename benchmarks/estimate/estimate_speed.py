@@ -38,7 +38,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         if not unpacked(older):
             yield Line(f"processor time over that of {COMMIT}", f"no git history with {COMMIT} here")
             return
-        for part in ("estimate", "records", "modal"):  # what poses a case is the same for both
+        for part in (".", "estimate", "records", "modal"):  # what poses a case is the same for both
             for name in (ROOT / "benchmarks" / part).glob("*.py"):
                 target = older / "benchmarks" / part / name.name
                 target.parent.mkdir(exist_ok=True)

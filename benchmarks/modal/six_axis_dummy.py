@@ -12,8 +12,8 @@ import scipy.linalg
 
 import sysid
 from sysid.frame import Beam, Frame, PointMass, Section
-from sysid.structure.sensor import BASE_AXES, rigid_motion
 
+AXES = ("x", "y", "z", "rx", "ry", "rz")
 MODES = 20
 BAND = (8.0, 200.0)  # Hz
 DAMPING = (0.01, 0.02)  # from the first mode to the last
@@ -48,7 +48,7 @@ def dummy() -> tuple[sysid.Structure, float]:
     frame = _frame()
     mass, stiffness = frame.matrices()
     assert isinstance(mass, np.ndarray) and isinstance(stiffness, np.ndarray)
-    rigid = rigid_motion(np.asarray(NODES), (0.0, 0.0, 0.0))
+    rigid = _rigid_motion(np.asarray(NODES))
     rigid_mass = rigid.T @ mass @ rigid
     length = float(np.sqrt(np.trace(rigid_mass[3:, 3:]) / np.trace(rigid_mass[:3, :3])))
     rigid = rigid / np.repeat([1.0, length], 3)
@@ -58,7 +58,7 @@ def dummy() -> tuple[sysid.Structure, float]:
         stiffness[np.ix_(free, free)], mass[np.ix_(free, free)], subset_by_index=[0, MODES - 1]
     )
     participation = shapes.T @ (mass @ rigid)[free]
-    seen = np.array([6 * node + BASE_AXES.index(axis) for node, axis in SENSORS])
+    seen = np.array([6 * node + AXES.index(axis) for node, axis in SENSORS])
     M = np.block([[np.eye(MODES), participation], [participation.T, rigid.T @ mass @ rigid]])
     K = scipy.linalg.block_diag(np.diag(lam), np.zeros((6, 6)))
     structure = sysid.Structure(
@@ -72,7 +72,7 @@ def spacecraft(modes: int, channels: int = 18) -> sysid.Structure:
     """The dummy on a base that moves in x, y and z, with so many modes and accelerometers, three at a node."""
     frame = _frame()
     mass, stiffness = (np.asarray(matrix) for matrix in frame.matrices())
-    rigid = rigid_motion(np.asarray(NODES), (0.0, 0.0, 0.0))[:, :3]
+    rigid = _rigid_motion(np.asarray(NODES))[:, :3]
     free = np.arange(6 * len(BASE), 6 * len(NODES))
     lam, shapes = scipy.linalg.eigh(
         stiffness[np.ix_(free, free)], mass[np.ix_(free, free)], subset_by_index=[0, modes - 1]
@@ -80,7 +80,7 @@ def spacecraft(modes: int, channels: int = 18) -> sysid.Structure:
     participation = shapes.T @ (mass @ rigid)[free]
     nodes = (13, 12, 14, 15, 16, 8, 5, 10)
     at = [(node, axis) for node in nodes for axis in "xyz"][:channels]
-    seen = np.array([6 * node + BASE_AXES.index(axis) for node, axis in at])
+    seen = np.array([6 * node + AXES.index(axis) for node, axis in at])
     M = np.block([[np.eye(modes), participation], [participation.T, rigid.T @ mass @ rigid]])
     K = scipy.linalg.block_diag(np.diag(lam), np.zeros((3, 3)))
     return sysid.Structure(
@@ -109,3 +109,10 @@ def _tube(radius: float, wall: float) -> Section:
     """A circular aluminium tube."""
     inertia = np.pi * radius**3 * wall
     return Section(E=69e9, G=26e9, A=2 * np.pi * radius * wall, Iy=inertia, Iz=inertia, J=2 * inertia, density=2700.0)
+
+
+def _rigid_motion(points: np.ndarray) -> np.ndarray:
+    """Motion of points (n, 3) for unit motions of the origin along and about each axis, (6 n, 6)."""
+    motion = np.tile(np.eye(6), (len(points), 1, 1))
+    motion[:, :3, 3:] = np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)  # theta × r
+    return motion.reshape(-1, 6)
