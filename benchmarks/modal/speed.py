@@ -42,7 +42,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             ):
                 taken.append([[_seconds(test) for test in group] for group in tests.values()])
                 if reduced:
-                    beside.append(fixed_work())
+                    beside.append(fixed_work(1))
         medians = np.median(np.min(taken, axis=0), axis=1)
         shown = "; ".join(f"{kind} {value:.2f}" for kind, value in zip(tests, medians, strict=True))
         what = f"largest median over {count} structures, least of {len(taken)}, processor s"

@@ -101,7 +101,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             continue
         words, seconds = "", figures["seconds"]
         if reduced:  # in CI, on machines that are slow for hours
-            words, seconds = at_full_speed(seconds, min(fixed_work() for _ in range(5)))
+            words, seconds = at_full_speed(seconds, fixed_work())
         yield below(f"{name}: seconds {words}".rstrip(), seconds, case.seconds)
         yield below(f"{name}: peak memory, GiB", figures["memory"], case.memory)
         yield Line(

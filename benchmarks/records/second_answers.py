@@ -113,7 +113,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     text, longest = f"longest search for other answers of these, {of}", max(looks)
     if reduced:
         yield Line(text, f"{longest:.3g}")
-        words, longest = at_full_speed(longest, min(fixed_work() for _ in range(5)))
+        words, longest = at_full_speed(longest, fixed_work())
         text = f"the same {words}"
     yield below(text, longest, LOOK)
 

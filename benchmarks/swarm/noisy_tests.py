@@ -97,10 +97,10 @@ def _time(what: str, runs: list[Run], seconds: float, again: Callable[[], list[R
     """Line of the median; in the reduced form of the least of up to three, beside the least of the fixed work."""
     words, median = "", _median(runs)
     if len(runs) < len(SEEDS):
-        times, beside = [median], min(fixed_work() for _ in range(5))
+        times, beside = [median], fixed_work()
         while at_full_speed(min(times), beside)[1] > seconds and len(times) < 3:
             times.append(_median(again()))
-            beside = min(beside, *(fixed_work() for _ in range(5)))
+            beside = min(beside, fixed_work())
         words, median = at_full_speed(min(times), beside)
     return below(f"{what}median seconds of a processor {words}".rstrip(), median, seconds)
 
