@@ -227,3 +227,29 @@ def finite_array(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any
         first = f", the first at index {tuple(bad[0])}" if array.ndim else ""
         raise InputError(f"{name} holds NaN or infinite entries ({len(bad)} of {array.size}{first})")
     return array
+
+
+def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> NDArray[np.floating[Any]]:
+    """Frequency lines in Hz as a finite, nonnegative (strictly increasing) one-dimensional array."""
+    lines = np.atleast_1d(finite_array("freq", freq))
+    if lines.ndim != 1 or lines.size == 0:
+        raise InputError(f"freq has shape {lines.shape}; a list of lines in Hz is needed")
+    if np.any((lines < 0) | (lines > 1e12)):
+        raise InputError(f"freq holds a negative line, or one above 1e12 Hz: {lines.min():g} to {lines.max():g} Hz")
+    if increasing and np.any(np.diff(lines) <= 0):
+        at = int(np.argmax(np.diff(lines) <= 0))
+        raise InputError(
+            f"freq must rise strictly: line {at + 1} is {lines[at + 1]:g} Hz after {lines[at]:g} Hz; "
+            "sort the lines and drop repeated ones"
+        )
+    return lines
+
+
+def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> NDArray[np.floating[Any]]:
+    """`finite_array` of this shape; a word in the shape stands for any length, the same wherever it occurs."""
+    array = finite_array(name, value)
+    lengths: dict[int | str, int] = dict(zip(shape, array.shape, strict=False))
+    lengths |= {length: length for length in shape if isinstance(length, int)}
+    if array.shape != tuple(lengths.get(length) for length in shape):
+        raise InputError(f"{name} has shape {array.shape}; it must be {shape}".replace("'", ""))
+    return array

@@ -153,6 +153,11 @@ class Perturbations(NamedTuple):
     log_ratios: Array
     rigid: Array
 
+    def of(self, modes: NDArray[np.bool_]) -> Perturbations:
+        """The moves of some of the modes, and of the rigid-body mass."""
+        poles = self.log_omega[modes], self.log_ratios[modes]
+        return Perturbations(self.normals, self.phi[:, modes], self.gamma[modes], *poles, self.rigid)
+
     def std(self, change: Array, size: ArrayLike) -> Array:
         """Standard deviations of quantities that change so, (...): see `std_of`."""
         return std_of(change, self.normals, size)

@@ -69,17 +69,24 @@ def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str,
         alike = f"other mass and stiffness matrices answer identically{bounded}"
         what = _what_is_open(structure, free, common)
         open_ += map(left_open, [f"{what}: {alike}", *[UNIT_MASS] * problem.unit_mass])
-    if not structure.at_sensors:
-        how_far = "completely" if test.force is not None and not free else "up to the modal masses"
-        alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
-        sentence = (
-            f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices "
-            "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
-            f"coordinates) is what the data determine, {how_far}"
-        )
-        open_.append(left_open(sentence, modes=structure.n, sensors=structure.n_sensors))
-    closed = () if free else tuple(filter(None, (known.sentence, _weighed_in_words(known, test, structure))))
-    return closed, tuple(open_)
+    closed = known.sentence, _weighed_in_words(known, test, structure), _in_band_in_words(test, structure)
+    return () if free else tuple(filter(None, closed)), tuple(open_)
+
+
+def _in_band_in_words(test: Measurement, structure: Structure) -> str:
+    """The degrees of freedom that hold the modes in the lines, where they are not the sensors; empty where they are."""
+    if structure.at_sensors:
+        return ""
+    sensors, beyond = int(np.count_nonzero(structure.dof_modes < 0)), structure.residual
+    others = structure.n - sensors
+    what = f"{structure.n} modes on {sensors} of {structure.n_sensors} sensors" + (
+        f" and {others} modal coordinates, which the Craig-Bampton form (to_craig_bampton()) holds" if others else ""
+    )
+    if beyond.count:
+        added = np.einsum("sk,kdf,rdf->rsf", beyond.shapes, beyond.motion(test.freq), test.base)
+        share = np.linalg.norm(added) / np.linalg.norm(test.relative)
+        what += f"; modes beyond the lines add {100 * share:.2g} % of the response, and are kept as residual modes"
+    return f"determined in {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz: {what}"
 
 
 def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) -> str:

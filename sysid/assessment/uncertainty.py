@@ -38,7 +38,7 @@ from sysid.assessment.sensitivity import (
     with_totals,
 )  # fmt: skip
 from sysid.assessment.statements import conditioned
-from sysid.errors import refuse
+from sysid.errors import check_frequencies, refuse
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
@@ -47,7 +47,7 @@ from sysid.models.unknowns import by_name, split
 from sysid.problem.direct_response import Slopes, rows_of_test, slopes_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.structure.structure import Array, Structure, check_frequencies
+from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
 
 LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
@@ -220,20 +220,23 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
     modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
+    own = np.isin(modes.omega, separated_modes(structure).omega)
     possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
-    matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, modes, moves)]
+    mine = Modes(modes.phi[:, own], modes.gamma[own], modes.omega[own], modes.ratios[own])
+    matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, mine, moves.of(own))]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = [open_, open_, open_]  # zeros that a decoupled structure keeps included
     by_gains = Perturbations(0, *index.split(shifts))
-    mass_by_gain, _ = next(changes_of_matrices(structure, modes, by_gains))
+    mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own)))
     by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))
-    found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
+    spectra = ModalSpectra(modes, moves, structure.rigid_body_mass)
+    found = _quantities(problem, structure, mine, moves.of(own), inflation, matrices, by_gain, spectra)
     if x is None or not np.any(problem.formulation.outside):
         return found
     variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
@@ -249,9 +252,9 @@ def moves_by_records(
 
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
-    modal, modes = problem.modal[0], separated_modes(structure)
+    modal, modes = problem.modal[0], _all_modes(structure)
     test = modal.records
-    index = Index(structure.n_sensors, structure.n, structure.n_base)
+    index = Index(structure.n_sensors, modes.omega.size, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B, spectra = noise_records(test, structure, unknowns), None, None
@@ -297,9 +300,10 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
         size = np.sqrt(np.abs(np.diag(matrix)))
         matrices.append(std_of(slope @ steps, count, np.outer(size, size)))
     by_gain = np.abs(np.einsum("iic,cs->si", slopes.mass, shifts))
-    found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
+    spectra: ModalSpectra | DirectSpectra = ModalSpectra(modes, moves, structure.rigid_body_mass)
     if not structure.modal_damping:
-        found = replace(found, _spectra=DirectSpectra(slopes, steps, count))
+        spectra = DirectSpectra(slopes, steps, count)
+    found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain, spectra)
     return _with_unknowns(found, problem, formulation, x, known)
 
 
@@ -357,9 +361,20 @@ def separated_modes(structure: Structure) -> Modes:
     return Modes(structure.mode_shapes, structure.participation, omega, ratios)
 
 
+def _all_modes(structure: Structure) -> Modes:
+    """`separated_modes` with the residual ones among them, ascending."""
+    own, beyond = separated_modes(structure), structure.residual
+    omega = np.concatenate([own.omega, beyond.omega])
+    order = np.argsort(omega, kind="stable")
+    return Modes(
+        np.hstack([own.phi, beyond.shapes])[:, order], np.vstack([own.gamma, beyond.participation])[order],
+        omega[order], np.concatenate([own.ratios, np.maximum(beyond.damping_ratios, NEGLIGIBLE)])[order],
+    )  # fmt: skip
+
+
 def _quantities(
     problem: Prepared, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
-    matrices: Sequence[Array], by_gain: Array,
+    matrices: Sequence[Array], by_gain: Array, spectra: ModalSpectra | DirectSpectra,
 ) -> Uncertainty:  # fmt: skip
     """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C.
 
@@ -407,6 +422,6 @@ def _quantities(
         parameters=tuple(names),
         covariance=covariance,
         inflation=inflation,
-        _spectra=ModalSpectra(modes, moves, structure.rigid_body_mass),
+        _spectra=spectra,
         mass_by_gain=by_gain,
     )

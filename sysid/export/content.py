@@ -10,7 +10,8 @@ import numpy as np
 from sysid.errors import shown_plainly
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
-from sysid.structure.structure import Array, CraigBampton, Structure
+from sysid.structure.structure import Array, Structure
+from sysid.structure.superelement import CraigBampton
 
 _UNITS = {"M": ("kg", "kg m", "kg m2"), "K": ("N/m", "N", "N m"), "C": ("N s/m", "N s", "N s m")}
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import (
     InputError,
     as_float,
+    check_frequencies,
     choice,
     flag,
     instance,
@@ -33,7 +34,7 @@ from sysid.structure.sensor import (
     sensors_from_tree,
     sensors_to_tree,
 )
-from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
+from sysid.structure.structure import Array, ComplexArray, Structure
 
 _FOLDED = 0.4  # of the sample rate; whole records are fitted up to it
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines

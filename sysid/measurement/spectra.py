@@ -9,8 +9,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, as_float, finite_array, listed, numbers, refuse, sequence, whole_number
-from sysid.structure.structure import Array, ComplexArray, shaped_array
+from sysid.errors import (
+    InputError,
+    as_float,
+    finite_array,
+    listed,
+    numbers,
+    refuse,
+    sequence,
+    shaped_array,
+    whole_number,
+)
+from sysid.structure.structure import Array, ComplexArray
 
 
 class TimeRun(NamedTuple):

@@ -20,8 +20,10 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
-from sysid.modal_analysis.response import gains, motion_and_slopes, real_times
+from sysid.modal_analysis.response import gains, modes_above, motion_and_slopes, real_times
 from sysid.structure.structure import Array, ComplexArray
+
+FAR = 30.0  # logarithms of frequencies and damping ratios: no step of use leads beyond
 
 
 class Run(NamedTuple):
@@ -212,7 +214,7 @@ class Lines:
             parts.append((g[:, None] * self.transients).reshape(-1, base.shape[1]))
         parts.append(self.trace_spectra)
         if self.model.gains:
-            parts.append((freq / self.model.test.freq[-1]) ** 2 * base)
+            parts += list(modes_above(freq, self.model.test.freq[-1])[:, None] * base)
         return np.concatenate(parts)
 
 

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import Lines, NormalEquations, Parameters, Run, SpectralModel, dots
+from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 
-_FAR = 30.0  # logarithms of frequencies and damping ratios
 TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w)
 KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
 
@@ -88,8 +87,7 @@ class RecordModel(SpectralModel):
     the rigid-body mass is left out.
 
     With `gains` there are further columns, to be asked of at an end, (n_sensors, d) of each kind: a constant share of
-    the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what modes above the lines make,
-    ``w² u``.
+    the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what `modes_above` the lines make.
     """
 
     def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
@@ -111,7 +109,7 @@ class RecordModel(SpectralModel):
         self.n_ends = m * 2 * len(self.moving)
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
-        self.size = self.n_fit + gains * 2 * self.n * self.d
+        self.size = self.n_fit + gains * 3 * self.n * self.d
 
     def transients(self, freq: Array) -> ComplexArray:
         """See `SpectralModel`."""
@@ -156,7 +154,7 @@ class RecordModel(SpectralModel):
         theta[: self.kept, 0] = x[: self.kept]
         phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(theta))
         # No step of use leads beyond these.
-        omega, ratios = np.exp(np.clip(log_omega, -_FAR, _FAR)), np.exp(np.clip(log_ratios, -_FAR, _FAR))
+        omega, ratios = np.exp(np.clip(log_omega, -FAR, FAR)), np.exp(np.clip(log_ratios, -FAR, FAR))
         modes = Modes(phi, gamma, omega, ratios)
         ends, traces = np.split(x[self.kept :], [self.n_ends])
         shape = (len(self.whole.samples), self.channels, TRACES)
@@ -290,7 +288,9 @@ class Chunk(Lines):
         yield first_trace + traces, last + traces, np.ones(TRACES)
         if model.gains and channel < n:
             yield model.n_fit + channel * d + beside, first[3] + beside, np.ones(d)
-            yield model.n_fit + (n + channel) * d + beside, last + TRACES + beside, np.ones(d)
+            for kind in (1, 2):
+                column = model.n_fit + (kind * n + channel) * d + beside
+                yield column, last + TRACES + (kind - 1) * d + beside, np.ones(d)
 
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""

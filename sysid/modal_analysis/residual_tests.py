@@ -294,12 +294,12 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     """A step of all unknowns from the end of a fit, the gains and what modes above the lines make among them.
 
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
-    better known of both is taken. Motion with the base in any of its directions is asked for without it.
+    better known of both is taken. Motion with the base in any of its directions is asked for beside that part.
     """
     equations, G = fit.equations, fit.test.rigid_body
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
-    along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
+    along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(2 * n * d))
     normal, size = unit_diagonal(along.T @ equations.normal @ along)
     gradient = along.T @ equations.gradient / size
 
@@ -329,11 +329,10 @@ def gain_errors_of(fit: RecordFit) -> Gains:
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
     equations, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
-    count = at + n * d
-    normal, size = unit_diagonal(equations.normal[:count, :count])
-    half = half_inverse(normal, ROUND_OFF)
-    step = (half @ (half.T @ (equations.gradient[:count] / size)))[at:].reshape(n, d)
-    inverse_rows = half[at:].reshape(n, d, -1)
+    normal, size = unit_diagonal(equations.normal)
+    half, asked = half_inverse(normal, ROUND_OFF), slice(at, at + n * d)
+    step = (half @ (half.T @ (equations.gradient / size)))[asked].reshape(n, d)
+    inverse_rows = half[asked].reshape(n, d, -1)
     covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)
-    return step / size[at:].reshape(n, d), chi2
+    return step / size[asked].reshape(n, d), chi2

@@ -9,6 +9,8 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
+_ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
+
 
 def columns(record: ComplexArray) -> ComplexArray:
     """All runs side by side: (runs, channels, n_freq) → (channels, runs * n_freq)."""
@@ -182,6 +184,12 @@ def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> Compl
     """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq); `shift` as above."""
     s = shift + 2j * np.pi * freq
     return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+
+
+def modes_above(freq: Array, last: float) -> Array:
+    """Functions w² and of a pole not far above the last line, Hz, which modes above the lines add, (2, n_freq)."""
+    s = freq / last
+    return np.stack([s**2, s**2 / (_ABOVE**2 - s**2)])
 
 
 def gains_with_velocity(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:

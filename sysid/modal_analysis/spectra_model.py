@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_fit import (
     separate_poles,
     slopes_of_modes,
 )
-from sysid.modal_analysis.modal_model import Lines, NormalEquations, Parameters, Run, SpectralModel, dots
+from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
@@ -130,7 +130,7 @@ class SpectraModel(SpectralModel):
         for (i, j), value in zip(self.index.pairs, corner, strict=False):
             rigid[i, j] = rigid[j, i] = value
         with np.errstate(over="ignore"):
-            omega, ratios = np.exp(log_omega), np.exp(log_ratios)
+            omega, ratios = np.exp(log_omega), np.exp(np.maximum(log_ratios, -FAR))
         return self.with_best_shapes(Modes(np.zeros((self.n, self.m)), gamma.reshape(self.m, -1), omega, ratios), rigid)
 
     def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:
@@ -266,6 +266,7 @@ def fit_spectra(
     rigid : (d, d)
         Rigid-body mass to start with; read where a force was measured.
     """
+    first = first._replace(ratios=np.maximum(first.ratios, np.exp(-FAR)))
     poles, pole = separate_poles(first)
     weights = weights_at(test, first.omega[poles], first.ratios[poles])
     model = SpectraModel(test, weights, pole)

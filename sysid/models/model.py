@@ -16,14 +16,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, finite_array, refuse, shown
+from sysid.errors import InputError, finite_array, refuse, shaped_array, shown
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate, estimated_poles
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.expressions import as_matrix, check_size, cholesky, square
 from sysid.models.unknowns import Unknown, variable_of
-from sysid.structure.structure import Array, Structure, shaped_array
+from sysid.structure.structure import Array, Structure
 
 # A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
 # condition number of 1e6, more than any test resolves.

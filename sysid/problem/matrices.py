@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, numbers, refuse
+from sysid.errors import InputError, numbers, refuse, shaped_array
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, weighed_mass
@@ -29,7 +29,7 @@ from sysid.models.model import (
 )
 from sysid.models.stiffness_and_damping import WrittenDamping, WrittenStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
-from sysid.structure.structure import Array, Structure, shaped_array
+from sysid.structure.structure import Array, Structure
 
 MATRICES = ("mass", "stiffness", "damping")
 _WRITTEN: dict[str, Any] = {"mass": WrittenMass, "stiffness": WrittenStiffness, "damping": WrittenDamping}

@@ -46,6 +46,7 @@ from sysid.search.modal_program import (
 from sysid.search.session import Session
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
+from sysid.structure.superelement import ResidualModes
 from sysid.structure.thresholds import AS_GOOD, CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
 Integers = NDArray[np.intp]
@@ -183,8 +184,9 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
 
 
 def structure_of_modes(
-    problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool
-) -> Structure:
+    problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool,
+    residual: ResidualModes,
+) -> Structure:  # fmt: skip
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
@@ -212,6 +214,7 @@ def structure_of_modes(
         recovery=None if plain else recovery,
         rigid_body=None if plain else geometry.rigid_body,
         sensors=problem.measurement.sensors,
+        residual=residual,
     )
 
 
@@ -309,8 +312,9 @@ def modal_structure(
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
-    chosen = degrees_of_freedom(problem, end.modes, options.sensors)
-    modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
+    modes, residual = _in_band(problem, end.modes)
+    chosen = degrees_of_freedom(problem, modes, options.sensors)
+    remainder = end.rigid - modes.gamma.T @ modes.gamma
     if test.force is None:
         t = _modal_masses(problem, modes, chosen)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
@@ -318,12 +322,27 @@ def modal_structure(
     # A stated total is kept, even where the base force weighs another.
     unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
     try:
-        return structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
+        structure = structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet, residual=residual)
+        return structure, end, chosen, poles
     except InputError as error:
         raise DoesNotApplyError(
             "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "
             f"wrong, or the responses are not absolute accelerations ({error})"
         ) from None
+
+
+def _in_band(problem: Prepared, modes: Modes) -> tuple[Modes, ResidualModes]:
+    """The modes of the structure, and those beyond the lines, which stand for all that are there.
+
+    A lumped or known mass has as many modes as sensors, wherever they are.
+    """
+    lines = 2 * np.pi * problem.measurement.freq[[0, -1]]
+    inside = (modes.omega >= lines[0]) & (modes.omega <= lines[1])
+    if not problem.formulation.mass.free or not np.any(inside):
+        inside[:] = True
+    phi, gamma, omega, ratios = modes
+    beyond = ResidualModes(omega[~inside] / (2 * np.pi), ratios[~inside], phi[:, ~inside], gamma[~inside])
+    return Modes(phi[:, inside], gamma[inside], omega[inside], ratios[inside]), beyond
 
 
 def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:

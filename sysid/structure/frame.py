@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, shaped_array
 from sysid.structure.beam import (
     SINGULAR,
     Array,
@@ -41,7 +41,7 @@ from sysid.structure.beam import (
     symmetric,
 )
 from sysid.structure.sensor import base_columns, rigid_motion, sensor_row, vector3
-from sysid.structure.structure import Structure, shaped_array
+from sysid.structure.structure import Structure
 from sysid.structure.thresholds import EXACT
 
 SensorAxis = tuple[int, str | ArrayLike]

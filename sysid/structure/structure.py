@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, as_float, finite_array, refuse, whole_number
+from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, whole_number
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
+from sysid.structure.superelement import CraigBampton, ResidualModes, modal_gains
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -20,25 +20,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
-
-
-@dataclass(frozen=True, eq=False)
-class CraigBampton:
-    """A structure in modal coordinates q (n) and base motions u_0 (d): ``M z'' + C z' + K z = [0; f_0]``, z = [q; u_0].
-
-    Attributes
-    ----------
-    mass, stiffness, damping : (n + d, n + d)
-        ``[[I, Gamma], [Gamma', M_rb]]``, ``diag(w², 0)`` and the modal damping, ``diag(2 zeta w, 0)`` where it is
-        classical; modes mass-normalised, in ascending order of frequency.
-    recovery : (n_sensors, n + d)
-        ``[Phi, G]``: takes z to the absolute motion of the sensors.
-    """
-
-    mass: Array
-    stiffness: Array
-    damping: Array
-    recovery: Array
 
 
 class Structure:
@@ -70,6 +51,8 @@ class Structure:
         Takes the degrees of freedom to the sensors; the identity by default.
     sensors : sequence of Sensor, optional
         Descriptions of the sensors, for tables and figures.
+    residual : ResidualModes, optional
+        What answers in the band with the structure's own modes; none by default.
 
     Attributes
     ----------
@@ -94,7 +77,8 @@ class Structure:
     effective_masses : (n, d, d)
         ``gamma_k' gamma_k`` of each mode.
     rigid_body_mass : (d, d)
-        ``[G; I]' M [G; I]``.
+        ``[G; I]' M [G; I]``, that of the residual modes included.
+    residual : ResidualModes
 
     Raises
     ------
@@ -126,6 +110,7 @@ class Structure:
         rigid_body: ArrayLike | None = None,
         recovery: ArrayLike | None = None,
         sensors: Sequence[Any] | None = None,
+        residual: ResidualModes | None = None,
     ) -> None:
         self.mass = _symmetric("mass", mass, "n + d")
         self.stiffness = _symmetric("stiffness", stiffness, "n + d")
@@ -153,6 +138,15 @@ class Structure:
         self.sensors = checked_sensors(sensors)
         if self.sensors is not None and len(self.sensors) != self.n_sensors:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
+        self.residual = residual or ResidualModes.none(self.n_sensors, self.n_base)
+        shape = len(self.residual.shapes), self.residual.participation.shape[1]
+        refuse(
+            (
+                shape != (self.n_sensors, self.n_base),
+                f"the residual modes are of {shape[0]} sensors and {shape[1]} base directions, the structure of "
+                f"{self.n_sensors} and {self.n_base}",
+            )
+        )
 
         G = self.rigid_body_dofs
         B = self.mass[:n, :n] @ G + self.mass[:n, n:]
@@ -171,13 +165,15 @@ class Structure:
             "damping_ratios": self.damping_ratios if self.modal_damping else None,
             "damping_matrix": None if self.modal_damping else self.damping,
             "n_base": self.n_base, "recovery": self.recovery, "rigid_body": self.rigid_body,
-            "sensors": sensors_to_tree(self.sensors),
+            "sensors": sensors_to_tree(self.sensors), "residual": vars(self.residual) if self.residual.count else None,
         }  # fmt: skip
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Structure:
         """Structure from a dictionary that `to_tree` made, exact to the bit."""
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"])})
+        beyond = tree.get("residual")  # structures of before have none
+        residual = None if beyond is None else ResidualModes(**beyond)
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual})
 
     @property
     def n_sensors(self) -> int:
@@ -194,7 +190,8 @@ class Structure:
     @property
     def at_sensors(self) -> bool:
         """True where the degrees of freedom are the sensors, one each and in their order."""
-        return self.n == self.n_sensors and np.array_equal(self.recovery, np.eye(self.n))
+        alone = self.n == self.n_sensors and self.residual.count == 0
+        return alone and np.array_equal(self.recovery, np.eye(self.n))
 
     @property
     def dof_modes(self) -> NDArray[np.intp]:
@@ -225,7 +222,9 @@ class Structure:
         -------
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
-        return np.tensordot(self.recovery, self._relative(freq), 1)
+        lines = check_frequencies(freq, increasing=False)
+        own = np.tensordot(self.recovery, self._relative(lines), 1)
+        return own + np.tensordot(self.residual.shapes, self.residual.motion(lines), 1)
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -241,7 +240,10 @@ class Structure:
         ndarray, complex, shape (d, d, n_freq)
             [force direction, base direction, line].
         """
-        return np.tensordot(self._coupling.T, self._relative(freq), 1) + self.rigid_body_mass[:, :, None]
+        lines, beyond = check_frequencies(freq, increasing=False), self.residual
+        own = np.tensordot(self._coupling.T, self._relative(lines), 1)
+        others: ComplexArray = np.tensordot(beyond.participation.T, beyond.motion(lines), 1)
+        return others + own + self.rigid_body_mass[:, :, None]
 
     def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Absolute accelerations of the sensors in time, under a base acceleration given by samples.
@@ -284,12 +286,12 @@ class Structure:
         True
         """
         motion, modal = self._in_time(base, sample_rate, initial)
-        return self.mode_shapes @ modal + self.rigid_body @ motion
+        return self._all_shapes @ modal + self.rigid_body @ motion
 
     def simulate_force(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Force of the base on the structure in time, (d, n_samples), N; see `simulate`."""
         motion, modal = self._in_time(base, sample_rate, initial)
-        return self.participation.T @ modal + self.rigid_body_mass @ motion
+        return self._modal_model.participation.T @ modal + self.rigid_body_mass @ motion
 
     def initial_state(self, base: ArrayLike, response: ArrayLike, sample_rate: float) -> Array:
         """Modal displacements and velocities at the first sample that explain records best, in least squares.
@@ -311,21 +313,36 @@ class Structure:
         samples = np.shape(base)[-1] if np.ndim(base) else 0
         measured = shaped_array("response", response, self.n_sensors, samples)
         left = measured - self.simulate(base, sample_rate)
-        return fitted_state(self._modal_model, self.mode_shapes, left, sample_rate)
+        own = ModalModel(self._omega, self._modal_damping_matrix, self.participation)
+        return fitted_state(own, self.mode_shapes, left, sample_rate)
 
     @property
     def _modal_model(self) -> ModalModel:
-        return ModalModel(self._omega, self._modal_damping_matrix, self.participation)
+        """The structure's own modes, then the residual ones."""
+        beyond = self.residual
+        loss = np.diag(2 * beyond.damping_ratios * beyond.omega)
+        return ModalModel(
+            np.concatenate([self._omega, beyond.omega]),
+            scipy.linalg.block_diag(self._modal_damping_matrix, loss),
+            np.vstack([self.participation, beyond.participation]),
+        )
+
+    @property
+    def _all_shapes(self) -> Array:
+        """The same modes at the sensors, (n_sensors, n + r)."""
+        return np.hstack([self.mode_shapes, self.residual.shapes])
 
     def _in_time(self, base: ArrayLike, sample_rate: float, initial: ArrayLike | None) -> tuple[Array, Array]:
-        """Base acceleration and modal accelerations, (n, n_samples)."""
+        """Base acceleration and modal accelerations, (n + r, n_samples); residual modes begin at rest."""
         motion = shaped_array("base", base, self.n_base, "n_samples")
         rate = as_float("sample_rate", sample_rate)
         refuse(
             (motion.shape[1] < 2, f"base has {motion.shape[1]} samples; at least two are needed"),
             (rate <= 0, f"sample_rate = {rate:g} Hz; it must be positive"),
         )
-        state = np.zeros((2, self.n)) if initial is None else shaped_array("initial", initial, 2, self.n)
+        state = np.zeros((2, self.n + self.residual.count))
+        if initial is not None:
+            state[:, : self.n] = shaped_array("initial", initial, 2, self.n)
         return motion, modal_accelerations(self._modal_model, motion, rate, state)
 
     def to_state_space(self) -> StateSpace:
@@ -334,43 +351,53 @@ class Structure:
         Returns
         -------
         scipy.signal.StateSpace
-            2n states ``[v, v']`` (the relative motion of the degrees of freedom), d inputs, n_sensors outputs.
+            2 (n + r) states ``[v, v']`` (the relative motion of the degrees of freedom, then of the residual modes), d
+            inputs, n_sensors outputs.
         """
         from scipy.signal import StateSpace
 
-        n, R = self.n, self.recovery
+        n, beyond, join = self.n, self.residual, scipy.linalg.block_diag
+        R = np.hstack([self.recovery, beyond.shapes])
         M_inv = scipy.linalg.inv(self.mass[:n, :n])
-        acceleration = np.hstack([-M_inv @ self.stiffness[:n, :n], -M_inv @ self.damping])
-        feed = -M_inv @ self._coupling
-        A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), acceleration])
+        spring = join(M_inv @ self.stiffness[:n, :n], np.diag(beyond.omega**2))
+        loss = join(M_inv @ self.damping, np.diag(2 * beyond.damping_ratios * beyond.omega))
+        acceleration = np.hstack([-spring, -loss])
+        feed = -np.vstack([M_inv @ self._coupling, beyond.participation])
+        A = np.vstack([np.hstack([np.zeros_like(spring), np.eye(len(spring))]), acceleration])
         return StateSpace(
             A, np.vstack([np.zeros((n, self.n_base)), feed]), R @ acceleration, R @ feed + self.rigid_body
         )
 
-    def to_craig_bampton(self) -> CraigBampton:
-        """Fixed-base modal coordinates beside the base's own degrees of freedom.
+    def to_craig_bampton(self, *, residual_vectors: bool = True) -> CraigBampton:
+        """Fixed-base modal coordinates, those of residual modes last, beside the base's own degrees of freedom.
 
         The response to base motion depends on the structure through this form alone; with the base force measured, a
         test determines all of it, whatever the number of sensors.
+
+        Parameters
+        ----------
+        residual_vectors : bool
+            Keep the coordinates of residual modes; without them the form has the structure's own modes alone.
 
         References
         ----------
         R. R. Craig, M. C. C. Bampton, AIAA J. 6 (1968) 1313-1319.
         """
+        kept = slice(None) if residual_vectors else slice(self.n)
+        omega, loss, gamma = (part[kept] for part in self._modal_model)
         base = np.zeros((self.n_base, self.n_base))
         return CraigBampton(
-            mass=np.block([[np.eye(self.n), self.participation], [self.participation.T, self.rigid_body_mass]]),
-            stiffness=scipy.linalg.block_diag(np.diag(self._omega**2), base),
-            damping=scipy.linalg.block_diag(self._modal_damping_matrix, base),
-            recovery=np.hstack([self.mode_shapes, self.rigid_body]),
+            mass=np.block([[np.eye(omega.size), gamma], [gamma.T, self.rigid_body_mass]]),
+            stiffness=scipy.linalg.block_diag(np.diag(omega**2), base),
+            damping=scipy.linalg.block_diag(loss[:, kept], base),
+            recovery=np.hstack([self._all_shapes[:, kept], self.rigid_body]),
         )
 
-    def _relative(self, freq: ArrayLike) -> ComplexArray:
+    def _relative(self, freq: Array) -> ComplexArray:
         """Relative acceleration of the degrees of freedom, (n, d, n_freq)."""
-        omega = 2 * np.pi * check_frequencies(freq, increasing=False)
+        omega = 2 * np.pi * freq
         if self.modal_damping:
-            lam = self._omega[:, None]
-            g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
+            g = modal_gains(omega, self._omega, self.damping_ratios)
             return (self.normal_modes[:, None] * self.participation.T) @ g
         n = self.n
         w = omega[:, None, None]
@@ -437,32 +464,6 @@ class Structure:
                 f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
             )
         return implied
-
-
-def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
-    """Frequency lines in Hz as a finite, nonnegative (strictly increasing) one-dimensional array."""
-    lines = np.atleast_1d(finite_array("freq", freq))
-    if lines.ndim != 1 or lines.size == 0:
-        raise InputError(f"freq has shape {lines.shape}; a list of lines in Hz is needed")
-    if np.any((lines < 0) | (lines > 1e12)):
-        raise InputError(f"freq holds a negative line, or one above 1e12 Hz: {lines.min():g} to {lines.max():g} Hz")
-    if increasing and np.any(np.diff(lines) <= 0):
-        at = int(np.argmax(np.diff(lines) <= 0))
-        raise InputError(
-            f"freq must rise strictly: line {at + 1} is {lines[at + 1]:g} Hz after {lines[at]:g} Hz; "
-            "sort the lines and drop repeated ones"
-        )
-    return lines
-
-
-def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> Array:
-    """`finite_array` of this shape; a word in the shape stands for any length, the same wherever it occurs."""
-    array = finite_array(name, value)
-    lengths: dict[int | str, int] = dict(zip(shape, array.shape, strict=False))
-    lengths |= {length: length for length in shape if isinstance(length, int)}
-    if array.shape != tuple(lengths.get(length) for length in shape):
-        raise InputError(f"{name} has shape {array.shape}; it must be {shape}".replace("'", ""))
-    return array
 
 
 def _symmetric(name: str, value: ArrayLike, size: int | str) -> Array:

@@ -20,7 +20,7 @@ from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit, linear_residues
-from sysid.modal_analysis.response import columns
+from sysid.modal_analysis.response import columns, modes_above
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
@@ -144,17 +144,19 @@ def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator
 def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tuple[Array, Array] | None:
     """Share of the base's motion in what each sensor's modes leave, (n_sensors, d), and its chi-squared.
 
-    None where modes answer for all of it.
+    Beside what modes above the lines add, which residual modes may miss. None where modes answer for all of it.
     """
     ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
-    extra = ones - free.Q @ (free.Q.T @ ones)
+    above = np.linalg.qr(np.hstack([free.Q, records.basis(modes_above(test.freq, test.freq[-1]) + 0j)]))[0]
+    extra = ones - above @ (above.T @ ones)
     if np.linalg.norm(extra) < MIMICKED * np.linalg.norm(ones):
         return None
     Q, R = np.linalg.qr(extra)
-    along = Q.T @ free.left
-    left = free.left - Q @ along
+    beside = free.left - above @ (above.T @ free.left)
+    along = Q.T @ beside
+    left = beside - Q @ along
     gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, free.residues.size + along.size, least=EXACT)
+    noise = records.noise(left, (above.shape[1] + len(along)) * left.shape[1], least=EXACT)
     return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
@@ -192,13 +194,13 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
         both = each + (EXACT**2 * (size[i] + size[j])) / lines.sum()
         apart = np.mean(np.abs(moves[i] - sign * moves[j]) ** 2 / both)
         if apart <= most and np.mean(np.abs(moves[[i, j]]) ** 2 / both, axis=1).min() > _SEEN**2:
-            # A fit of fewer modes than there are leaves all that would tell its sensors apart.
-            few = f", or modes are missing: {structure.n} tell no more than {structure.n} of {test.n_sensors} apart"
+            # Of more sensors than modes some move alike, and no harm is done.
+            spare = structure.n < test.n_sensors
             yield Finding(
-                "one motion", Severity.CONTRADICTS,
-                f"sensors {names[j]} and {names[i]} record one motion but for noise and are one degree of freedom"
-                + few * (structure.n < test.n_sensors),
-                "leave one out", channel=names[j], numbers={"sensor": float(j), "other": float(i)},
+                "one motion", Severity.NOTE if spare else Severity.CONTRADICTS,
+                f"sensors {names[j]} and {names[i]} record one motion but for noise"
+                + (f" in the {structure.n} modes" if spare else " and are one degree of freedom"),
+                "" if spare else "leave one out", channel=names[j], numbers={"sensor": float(j), "other": float(i)},
             )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
-from sysid.modal_analysis.response import gains_and_slopes
+from sysid.modal_analysis.response import gains_and_slopes, modes_above
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
@@ -77,10 +77,10 @@ class GainErrors:
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     """Errors of sensors' gains by the constant terms of a test, at the poles of the structure that was fitted to it.
 
-    Each is estimated twice, beside the modes alone and beside a part that grows as w² too. The first is the more
-    exact, but right only where no mode lies above the lines: by how much the two differ counts among its errors. The
-    one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that share it
-    are counted as such; noise that is stated larger counts as stated.
+    Each is estimated twice, beside the modes alone and beside what `modes_above` the lines may add too. The first is
+    the more exact, but right only where no mode lies above the lines: by how much the two differ counts among its
+    errors. The one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that
+    share it are counted as such; noise that is stated larger counts as stated.
     """
     test, gain = modal.records, modal.gain
     if modal.by_modes:
@@ -89,12 +89,12 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (1 + velocity)
-    if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 2 * test.n_base):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 3 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)
         return GainErrors(unknown, unknown, np.zeros(test.n_sensors), 1)
     free = records.fit(*poles, velocity=velocity)
-    rise = (test.freq / test.freq[-1]) ** 2
-    ones, rising = (records.basis(part[None] + 0j) for part in (np.ones_like(rise), rise))
+    above = modes_above(test.freq, test.freq[-1])
+    ones, rising = (records.basis(part + 0j) for part in (np.ones((1, test.freq.size)), above))
     slopes = records.basis(gains_and_slopes(test.freq, *poles)[1][: 0 if velocity else None])
     plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
@@ -114,7 +114,10 @@ def _beyond(error: Array, std: Array) -> Array:
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:
-    """Distinct poles, rad/s and ratios; of a damping matrix those of the damped motion, which no undamped mode has."""
+    """Distinct poles, rad/s and ratios, of residual modes too.
+
+    Of a damping matrix those of the damped motion, which no undamped mode has.
+    """
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
     if not structure.modal_damping:
         zero, one = np.zeros((omega.size, omega.size)), np.eye(omega.size)
@@ -123,6 +126,8 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
         fast, slow = np.sort(s[s.imag == 0].real).reshape(-1, 2).T  # any two real ones make the same functions
         omega = np.concatenate([np.abs(s[s.imag > 0]), np.sqrt(fast * slow)])
         ratios = -np.concatenate([s[s.imag > 0].real, (fast + slow) / 2]) / omega
+    omega = np.append(omega, structure.residual.omega)
+    ratios = np.append(ratios, structure.residual.damping_ratios)
     poles = omega * (1 + 1j * ratios)
     first = ~np.triu(np.abs(poles[:, None] - poles) <= NEGLIGIBLE * omega, 1).any(axis=0)
     return omega[first], ratios[first]

@@ -1,0 +1,108 @@
+"""Forms of a structure that answer its base alone: the Craig-Bampton form, and residual modes beside its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.errors import refuse, shaped_array
+
+Array = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualModes:
+    """Modes beyond the band of a test, r of them: in the band they add what all modes beyond it add together.
+
+    They are poles of a fit, and no modes of the structure: their frequencies, ratios and masses mean nothing by
+    themselves.
+
+    Attributes
+    ----------
+    natural_frequencies : (r,)
+        Hz.
+    damping_ratios : (r,)
+    shapes : (n_sensors, r)
+        kg^-1/2.
+    participation : (r, d)
+        kg^1/2 (kg^1/2 m for a rotation of the base).
+
+    Raises
+    ------
+    InputError
+        Where shapes do not agree, a frequency is not positive or a damping ratio negative.
+
+    References
+    ----------
+    D. J. Ewins, Modal Testing: Theory, Practice and Application (2000), section 4.5 (residuals of modes outside the
+    range of analysis).
+    """
+
+    natural_frequencies: Array
+    damping_ratios: Array
+    shapes: Array
+    participation: Array
+
+    def __post_init__(self) -> None:
+        for name, *shape in (("natural_frequencies", "r"), ("damping_ratios", "r"), ("shapes", "n_sensors", "r"),
+                             ("participation", "r", "d")):  # fmt: skip
+            object.__setattr__(self, name, shaped_array(f"residual {name}", getattr(self, name), *shape))
+        counts = {self.damping_ratios.size, self.shapes.shape[1], len(self.participation)}
+        refuse(
+            (
+                counts != {self.count},
+                f"residual modes: {self.count} frequencies, but {sorted(counts)} ratios, shapes, loads",
+            ),
+            (np.any(self.natural_frequencies <= 0), "the frequency of a residual mode is not positive"),
+            (np.any(self.damping_ratios < 0), "the damping ratio of a residual mode is negative"),
+        )
+
+    @classmethod
+    def none(cls, n_sensors: int, n_base: int) -> ResidualModes:
+        """No modes."""
+        return cls(np.zeros(0), np.zeros(0), np.zeros((n_sensors, 0)), np.zeros((0, n_base)))
+
+    @property
+    def count(self) -> int:
+        """Number r of modes."""
+        return int(self.natural_frequencies.size)
+
+    @property
+    def omega(self) -> Array:
+        """Circular frequencies, rad/s, (r,)."""
+        return 2 * np.pi * self.natural_frequencies
+
+    def motion(self, freq: Array) -> ComplexArray:
+        """Modal accelerations at lines in Hz per unit base acceleration, (r, d, n_freq)."""
+        g = modal_gains(2 * np.pi * freq, self.omega, self.damping_ratios)
+        return self.participation[:, :, None] * g[:, None]
+
+
+def modal_gains(w: Array, omega: Array, ratios: Array) -> ComplexArray:
+    """Relative acceleration of modes per unit load, ``w² / (w_k² - w² + 2 i zeta_k w_k w)``, (m, L); all in rad/s."""
+    return np.asarray(w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w), dtype=complex)
+
+
+@dataclass(frozen=True, eq=False)
+class CraigBampton:
+    """A structure in modal coordinates q (n) and base motions u_0 (d): ``M z'' + C z' + K z = [0; f_0]``, z = [q; u_0].
+
+    The coordinates of residual modes, where they are kept, are the last of q, so that n is their number too.
+
+    Attributes
+    ----------
+    mass, stiffness, damping : (n + d, n + d)
+        ``[[I, Gamma], [Gamma', M_rb]]``, ``diag(w², 0)`` and the modal damping, ``diag(2 zeta w, 0)`` where it is
+        classical; modes mass-normalised, in ascending order of frequency.
+    recovery : (n_sensors, n + d)
+        ``[Phi, G]``: takes z to the absolute motion of the sensors.
+    """
+
+    mass: Array
+    stiffness: Array
+    damping: Array
+    recovery: Array
