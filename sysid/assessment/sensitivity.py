@@ -42,11 +42,29 @@ def parametrisation(problem: Prepared, structure: Structure, modes: Modes, index
     else:
         for entry, row in _tied_masses(problem, modes, index):
             slope[entry], keep[entry] = row, False
+    static = structure.residual.static
+    if static:  # its pole is none that is fitted, and turning these modes into each other changes nothing
+        keep[index.log_omega][-static:] = keep[index.log_ratios][-static:] = False
+        gauge = np.hstack([gauge, _turns(phi, gamma, index, static, all_=test.force is None)])
     free = Parametrisation(slope, unit, gauge)
     if not problem.formulation.damping.free:
         free, keep[index.log_ratios] = _with_ratios_tied(problem, structure, modes, index, free), False
     keep = np.pad(keep, (0, free.unit.size - keep.size), constant_values=True)
     return Parametrisation(free.slope[:, keep], free.unit[keep], free.gauge[keep])
+
+
+def _turns(phi: Array, gamma: Array, index: Index, count: int, *, all_: bool) -> Array:
+    """Moves of theta, (size, moves), that mix the last modes, at one pole: rotations, or with `all_` any but scales."""
+    last, columns = range(len(gamma) - count, len(gamma)), []
+    for i, j in ((i, j) for i in last for j in last if i < j or (all_ and i > j)):
+        of_phi, of_gamma = np.zeros_like(phi), np.zeros_like(gamma)
+        of_phi[:, i], of_gamma[j] = phi[:, j], -gamma[i]
+        if not all_:
+            of_phi[:, j], of_gamma[i] = -phi[:, i], gamma[j]
+        column = np.zeros(index.size)
+        column[index.phi], column[index.gamma] = of_phi.ravel(), of_gamma.ravel()
+        columns.append(column)
+    return np.array(columns).reshape(-1, index.size).T
 
 
 def _with_ratios_tied(

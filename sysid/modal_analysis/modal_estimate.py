@@ -101,6 +101,8 @@ class ModalEstimate:
         Indices, as in `Excess`. Levels of `noise` that the records do not determine.
     fit : ModalFit or None
         Of the modes of lines that stand for themselves.
+    static : int
+        So many modes, the last, stand for all above the lines: see `ModalFit`.
     lacking : str
         Why these lines cannot fix their modes; empty where they can, or nothing asked.
     in_motion : tuple of int
@@ -128,6 +130,7 @@ class ModalEstimate:
     in_motion: tuple[int, ...] = ()
     untold: tuple[tuple[int, int], ...] = ()
     fit: ModalFit | None = None
+    static: int = 0
     lacking: str = ""
     record_fit: RecordFit | None = None
 

@@ -115,6 +115,10 @@ def held_gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray
     return gauge, held
 
 
+STATIC_POLE = 2.0, 0.01  # of modes that stand for all above the lines: times the last line, where masses stay
+# positive, and damping ratio
+
+
 def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes:
     """Modal model nearest to residues (m, n, d); `size` (m,) of the shapes, as the split of a residue is free."""
     u, s, vt = np.linalg.svd(residues)
@@ -162,6 +166,9 @@ class ModalFit:
         Bounds that the solution presses on, in words.
     weights : Weights or None
         Of channels and lines, where they are those of plain spectra.
+    static : int
+        So many modes, the last, stand at one pole above the lines that is held: their static answer is that of all
+        modes there.
     """
 
     modes: Modes
@@ -171,6 +178,7 @@ class ModalFit:
     status: str
     bounds: str
     weights: Weights | None = None
+    static: int = 0
 
 
 def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[Array, Array]:

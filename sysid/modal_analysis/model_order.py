@@ -19,9 +19,19 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes, held_gauge
 from sysid.modal_analysis.modal_model import Lines
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    RecordFit,
+    half_inverse,
+    record_modes,
+    refitted,
+    unit_diagonal,
+    without,
+    worth,
+)
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.residual_tests import line_blocks, uneven
 from sysid.modal_analysis.response import gains
@@ -31,6 +41,7 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
+_LIGHT = 0.1  # share of the spare mass that modes above the lines begin with
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
@@ -73,6 +84,67 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
     if not more.settled or more.likelihood - fit.likelihood < added * least:
         return None
     return None if np.any(no_modes(more)) or np.min(worth(more)) < least else more
+
+
+def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> RecordFit:
+    """The fit with as many modes as base directions at a far pole, held, where it misses what modes above add.
+
+    See `ModeFit.with_static` of spectra.
+    """
+    test, p, d = fit.test, fit.parameters, fit.test.n_base
+    if fit.static or fit.stopped or not fit.settled:
+        return fit
+    worth, rise = _rise(fit)
+    if worth < beyond_chance(rise.size):
+        return fit
+    times, ratio = STATIC_POLE
+    far = times * 2 * np.pi * float(test.freq[-1])
+    near = p.modes.omega < (1 + times) / 2 / times * far
+    p = without(fit, ~near)
+    if fit.model.force:
+        spare = np.diag(p.rigid - p.modes.gamma.T @ p.modes.gamma)
+        gamma = np.sqrt(_LIGHT * np.maximum(spare, _LIGHT * np.diag(p.rigid)))
+    else:
+        gamma = np.sqrt(np.mean(p.modes.gamma**2, axis=0))
+    phi, held = times**2 * rise / gamma, np.full(d, far)
+    modes = Modes(
+        np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, np.diag(gamma)]), np.append(p.modes.omega, held),
+        np.append(p.modes.ratios, np.full(d, ratio)),
+    )  # fmt: skip
+    first = replace(p, modes=modes, ends=np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
+    more = refitted(fit, first, monitor=monitor, static=d)
+    unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
+    inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]
+    gained = 2 * (more.likelihood - fit.likelihood)
+    if not more.settled or inside[0] != inside[1] or gained < beyond_chance(unknowns):
+        return fit
+    return _in_gauge(more)
+
+
+def _rise(fit: RecordFit) -> tuple[float, Array]:
+    """Chi-squared of what grows as w² in the sensors, which all of a fit follows; its size where nothing does, (n, d)."""
+    (n, d), at, equations = fit.test.rigid_body.shape, fit.model.size, fit.equations
+    asked = slice(at + n * d, at + 2 * n * d)
+    seen = np.r_[np.arange(at), np.arange(asked.start, asked.stop)]
+    normal, size = unit_diagonal(equations.normal[np.ix_(seen, seen)])
+    half = half_inverse(normal[:at, :at], ROUND_OFF)
+    across, gradient = half.T @ normal[:at, at:], equations.gradient[seen] / size
+    left = gradient[at:] - across.T @ (half.T @ gradient[:at])
+    free, alone = (half_inverse(one, ROUND_OFF) for one in (normal[at:, at:] - across.T @ across, normal[at:, at:]))
+    worth = 2 * float(np.sum((free.T @ left) ** 2)) / max(fit.reduced, 1.0)
+    return worth, (alone @ (alone.T @ gradient[at:]) / size[at:]).reshape(n, d)
+
+
+def _in_gauge(fit: RecordFit) -> RecordFit:
+    """The same fit, its static modes turned into each other to the form that `held_gauge` keeps."""
+    p, d = fit.parameters, fit.static
+    last = Modes(p.modes.phi[:, -d:], p.modes.gamma[-d:], p.modes.omega[-d:], p.modes.ratios[-d:])
+    gauge = held_gauge(last, np.ones(d), fit.model.force)[0]
+    phi = last.phi @ last.gamma @ np.linalg.inv(gauge)
+    modes = p.modes._replace(
+        phi=np.hstack([p.modes.phi[:, :-d], phi]), gamma=np.vstack([p.modes.gamma[:-d], gauge])
+    )  # fmt: skip
+    return replace(fit, parameters=replace(p, modes=modes))
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:

@@ -65,6 +65,8 @@ class RecordFit:
         Whether the fit came to its end.
     stopped : bool
         Whether the search for modes was stopped, and this is the best until then.
+    static : int
+        So many modes, the last, stand for all above the lines: see `ModalFit`.
     """
 
     test: Measurement
@@ -73,16 +75,17 @@ class RecordFit:
     chi2: float
     settled: bool
     stopped: bool = False
+    static: int = 0
 
     @cached_property
     def model(self) -> RecordModel:
         """The model that was fitted."""
-        return RecordModel(self.test, self.parameters.modes.omega.size)
+        return RecordModel(self.test, self.parameters.modes.omega.size, static=self.static)
 
     @cached_property
     def equations(self) -> NormalEquations:
         """Normal equations at the end of the fit, with the columns of gains, which come last."""
-        model = RecordModel(self.test, self.parameters.modes.omega.size, gains=True)
+        model = RecordModel(self.test, self.parameters.modes.omega.size, gains=True, static=self.static)
         return model.normal_equations(self.parameters, self.levels)
 
     @property
@@ -152,7 +155,8 @@ class RecordFit:
         p = self.parameters
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
-            "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "varying": self.model.whole.varying,
+            "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
+            "varying": self.model.whole.varying,
         }  # fmt: skip
 
     @classmethod
@@ -167,7 +171,7 @@ class RecordFit:
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"])
-        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"])
+        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"])
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
         shapes: list[tuple[int, ...]] = [
@@ -203,15 +207,16 @@ def refitted(
     limits: Limits = WHOLE,
     some: Measurement | None = None,
     monitor: FitMonitor | None = None,
+    static: int | None = None,
 ) -> RecordFit:
     """The fit from other parameters, and from its levels of noise, within limits: of `ROUGH` it takes a few steps.
 
     Where lines are many, `some` is the test at a few of them, which give the normal matrix of each step. Gradients and
     what is left are those of all lines, so that the end is theirs.
     """
-    m = p.modes.omega.size
-    coarse = None if some is None else RecordModel(some, m).weighed_as_all()
-    return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or FitMonitor(), limits, coarse)
+    m, static = p.modes.omega.size, fit.static if static is None else static
+    coarse = None if some is None else RecordModel(some, m, static=static).weighed_as_all()
+    return _fit(RecordModel(fit.test, m, static=static), p, fit.levels, monitor or FitMonitor(), limits, coarse)
 
 
 def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
@@ -221,7 +226,7 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
     """
     m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
     first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, TRACES)))
-    return _fit(HeldShapes(test, m, poles=held), first, None, FitMonitor(), _POLES)
+    return _fit(HeldShapes(test, m, poles=held, static=fit.static), first, None, FitMonitor(), _POLES)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
@@ -231,8 +236,8 @@ def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | Non
 
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
     """The same in one step, with levels and sum of squares of all lines; settled where the fit of some lines was."""
-    model = RecordModel(test, fit.parameters.modes.omega.size)
-    coarse = RecordModel(fit.test, model.m).weighed_as_all()
+    model = RecordModel(test, fit.parameters.modes.omega.size, static=fit.static)
+    coarse = RecordModel(fit.test, model.m, static=fit.static).weighed_as_all()
     one = _fit(model, fit.parameters, fit.levels, FitMonitor(), Limits(1, 1), coarse)
     return replace(one, settled=fit.settled)
 
@@ -265,7 +270,7 @@ def _fit(
             break
     if stated is None:
         chi2 = model.chi2(p, levels)  # at the last levels
-    return RecordFit(test, p, levels, chi2, settled)
+    return RecordFit(test, p, levels, chi2, settled, static=model.static)
 
 
 def _minimise(

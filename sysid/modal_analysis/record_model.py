@@ -88,9 +88,16 @@ class RecordModel(SpectralModel):
 
     With `gains` there are further columns, to be asked of at an end, (n_sensors, d) of each kind: a constant share of
     the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what `modes_above` the lines make.
+
+    The last `static` modes share a pole that is held, and do not move at the ends of runs.
+
+    Attributes
+    ----------
+    held : (size,) of bool
+        Unknowns that stay as they are.
     """
 
-    def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
+    def __init__(self, test: Measurement, m: int, *, gains: bool = False, static: int = 0) -> None:
         assert test.whole is not None
         self.whole = test.whole
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
@@ -110,6 +117,12 @@ class RecordModel(SpectralModel):
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
         self.size = self.n_fit + gains * 3 * self.n * self.d
+        self.static, self.held = static, np.zeros(self.size, bool)
+        if static:
+            ends = self.held[self.kept : self.kept + self.n_ends].reshape(m, -1)
+            poles = self.held[self.index.log_omega], self.held[self.index.log_ratios]
+            for part in (ends, *poles):
+                part[m - static :] = True
 
     def transients(self, freq: Array) -> ComplexArray:
         """See `SpectralModel`."""
@@ -163,7 +176,8 @@ class RecordModel(SpectralModel):
     @property
     def unknowns(self) -> int:
         """Numbers that the records determine: without a force the scale of each mode is none."""
-        return self.size - (0 if self.force else self.m)
+        turns = self.static * (self.static - 1) // (2 if self.force else 1)
+        return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns
 
     def scales(self, p: Parameters) -> Array:
         """Moves of all unknowns that change nothing, (k, size): without a force, shape against load of each mode."""
@@ -206,6 +220,8 @@ class RecordModel(SpectralModel):
                 normal[np.ix_(at, at)] += products.normal
             gradient[at] += products.gradient
             chi2 += products.chi2
+        if np.any(self.held):
+            normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
         return NormalEquations(normal, gradient, chi2)
 
 
@@ -215,11 +231,10 @@ class HeldShapes(RecordModel):
     What is left to be found are poles, transients and traces.
     """
 
-    def __init__(self, test: Measurement, m: int, *, poles: bool = False) -> None:
-        super().__init__(test, m)
-        self.held = np.ones(self.size, bool)
-        self.held[self.index.log_omega] = self.held[self.index.log_ratios] = poles
-        self.held[self.kept :] = False
+    def __init__(self, test: Measurement, m: int, *, poles: bool = False, static: int = 0) -> None:
+        super().__init__(test, m, static=static)
+        self.held[: self.index.log_omega.start], self.held[self.index.log_ratios.stop : self.kept] = True, True
+        self.held[self.index.log_omega.start : self.index.log_ratios.stop] |= poles
 
     def scales(self, p: Parameters) -> Array:
         """See `RecordModel`: with shapes held there are none."""
@@ -229,11 +244,6 @@ class HeldShapes(RecordModel):
     def unknowns(self) -> int:
         """Numbers that are not held."""
         return int(np.sum(~self.held))
-
-    def _products(self, p: Parameters, levels: Array, each: Callable[[Chunk, Array, Columns], Sums]) -> NormalEquations:
-        normal, gradient, chi2 = super()._products(p, levels, each)
-        normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
-        return NormalEquations(normal, gradient, chi2)
 
 
 class Chunk(Lines):

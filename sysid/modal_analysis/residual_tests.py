@@ -273,7 +273,7 @@ def _moving(fit: RecordFit, runs: tuple[int, ...]) -> tuple[RecordFit, Parameter
 
 def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
-    model = RecordModel(fit.test, p.modes.omega.size)
+    model = RecordModel(fit.test, p.modes.omega.size, static=fit.static)
     equations = model.normal_equations(p, fit.levels)
     N, size = unit_diagonal(equations.normal)
     gradient = equations.gradient / size

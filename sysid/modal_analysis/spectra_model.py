@@ -105,6 +105,11 @@ class SpectraModel(SpectralModel):
         self._free[: gamma.size] = ~held.ravel()
         self._held[: gamma.size] = gamma.ravel()
 
+    def hold_last_pole(self, modes: Modes) -> None:
+        """Leave the last pole as it is."""
+        at = self.m * self.d + self._first.size * np.array([1, 2]) - 1
+        self._free[at], self._held[at] = False, np.log([modes.omega[-1], modes.ratios[-1]])
+
     @property
     def levels_of_accelerations(self) -> Array:
         """Variances with which the force has no weight."""
@@ -252,7 +257,7 @@ def _inverse(gram: Array) -> Array:
 
 
 def fit_spectra(
-    test: Measurement, first: Modes, rigid: Array, *, monitor: IterationMonitor, max_iterations: int
+    test: Measurement, first: Modes, rigid: Array, *, static: int = 0, monitor: IterationMonitor, max_iterations: int
 ) -> ModalFit:
     """Modes with the least weighted squared error of accelerations and, where it was measured, base force.
 
@@ -265,6 +270,8 @@ def fit_spectra(
         Where to start; shapes are not read. Modes whose poles are equal keep one pole.
     rigid : (d, d)
         Rigid-body mass to start with; read where a force was measured.
+    static : int
+        So many modes, the last, share a pole that is held.
     """
     first = first._replace(ratios=np.maximum(first.ratios, np.exp(-FAR)))
     poles, pole = separate_poles(first)
@@ -274,6 +281,8 @@ def fit_spectra(
     gauge, held = held_gauge(first, unit, test.force is not None)
     first = first._replace(gamma=gauge * unit)
     model.hold(first.gamma, held)
+    if static:
+        model.hold_last_pole(first)
 
     def tell(_: int, p: Parameters, chi2: float) -> bool:
         return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)
@@ -287,4 +296,4 @@ def fit_spectra(
     p, chi2, settled = minimise(problem, tell, max_iterations, enough)
     status = "settled" if settled else "stopped" if monitor.stopped is not None else "not settled"
     of_accelerations = np.sqrt(model.chi2(p, model.levels_of_accelerations))
-    return ModalFit(p.modes, p.rigid, float(np.sqrt(chi2)), float(of_accelerations), status, "", weights)
+    return ModalFit(p.modes, p.rigid, float(np.sqrt(chi2)), float(of_accelerations), status, "", weights, static)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, weigh
+from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
+from sysid.modal_analysis.response import modes_above
 from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.nlp import IterationMonitor
@@ -25,7 +26,7 @@ _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 
 
 def fit_modes_of_lines(
-    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, monitor: IterationMonitor,
+    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, residual: bool, monitor: IterationMonitor,
     max_iterations: int,
 ) -> ModalEstimate:  # fmt: skip
     """Fit modes at the poles of a test whose lines stand for themselves: its estimate with these, ascending.
@@ -40,6 +41,8 @@ def fit_modes_of_lines(
         Size of participations, kg^½, m kg^½ for rotations.
     count : int or None
         Of modes, one each at the poles whose loss the records would feel most; as many as the records need where None.
+    residual : bool
+        Beside as many as the records need, let modes stand for all that are above the lines where the records ask.
     monitor : IterationMonitor
     max_iterations : int
         Of each fit.
@@ -67,10 +70,14 @@ def fit_modes_of_lines(
     if lacking:
         return replace(modal, lacking=lacking)
     found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
+    if residual and count is None:
+        found = fit.with_static(found)
     phi, gamma, omega, ratios = found.modes
     order = np.argsort(omega, kind="stable")
     modes = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
-    return replace(modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes))
+    return replace(
+        modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +119,41 @@ class ModeFit:
             if gained > np.sign(more) * beyond_chance(abs(more) * (n + d), CANDIDATES):
                 best = other
         return best
+
+    def with_static(self, best: ModalFit) -> ModalFit:
+        """The fit, with as many modes as base directions at a far pole, held, where it leaves what modes above add.
+
+        Their answer is theirs at low frequency, of all together, with a mass that is positive: what is left grows as
+        w². Free poles that are as far give way.
+        """
+        test, (_, d) = self.test, self.test.rigid_body.shape
+        if not self._goes_on or not self._misses_static(best):
+            return best
+        times, ratio = STATIC_POLE
+        far = times * 2 * np.pi * float(test.freq[-1])
+        first, pole = separate_poles(best.modes)
+        near = best.modes.omega[first] < (1 + times) / 2 / times * far
+        omega, ratios = (np.append(part[first][near], one) for part, one in
+                         ((best.modes.omega, far), (best.modes.ratios, ratio)))  # fmt: skip
+        poles, counts = replace(self.poles, omega=omega, ratios=ratios), np.append(np.bincount(pole)[near], d)
+        more = replace(self, poles=poles).of_modes(counts, static=d)
+        unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
+        gained = (best.residual**2 - more.residual**2) * self.records.size
+        noise = self._free(more, counts)[1]
+        inside = [np.count_nonzero(one.modes.omega < 2 * np.pi * test.freq[-1]) for one in (best, more)]
+        lost = inside[0] != inside[1]  # a pole that comes into the lines is no mode
+        return best if lost or gained < noise * beyond_chance(max(unknowns, 1)) else more
+
+    def _misses_static(self, best: ModalFit) -> bool:
+        """True where what free residues leave at the poles of a fit grows as w², beyond chance."""
+        records, first = self.records, separate_poles(best.modes)[0]
+        if best.of_accelerations <= EXACT:
+            return False
+        free = records.fit(best.modes.omega[first], best.modes.ratios[first])
+        rising = records.basis(modes_above(self.test.freq, self.test.freq[-1])[:1] + 0j)
+        along = np.linalg.qr(rising - free.Q @ (free.Q.T @ rising))[0].T @ free.left
+        noise = records.noise(free.left, free.residues.size)
+        return bool(np.sum(along**2) > noise * beyond_chance(along.size))
 
     def at_strongest(self, count: int) -> ModeFit:
         """The same at so many poles: those whose loss the records would feel most.
@@ -194,8 +236,8 @@ class ModeFit:
         left[multiplicity >= min(n, d)] = 0.0
         return int(np.argmax(left)) if left.max() > 0 else None
 
-    def of_modes(self, multiplicity: Integers) -> ModalFit:
-        """Fit with so many modes at each pole, from its free residue's largest singular values."""
+    def of_modes(self, multiplicity: Integers, *, static: int = 0) -> ModalFit:
+        """Fit with so many modes at each pole, from its free residue's largest singular values; `static` as above."""
         test, poles, unit = self.test, self.poles, self.unit
         residues, _ = linear_residues(test, poles.omega, poles.ratios)
         pole = np.repeat(np.arange(poles.omega.size), multiplicity)
@@ -208,4 +250,6 @@ class ModeFit:
         if test.force is not None:
             t, rigid = weigh(test, modes)
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
-        return fit_spectra(test, modes, rigid, monitor=self.monitor, max_iterations=self.max_iterations)
+        return fit_spectra(
+            test, modes, rigid, static=static, monitor=self.monitor, max_iterations=self.max_iterations
+        )  # fmt: skip

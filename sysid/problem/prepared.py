@@ -17,6 +17,7 @@ from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
@@ -236,10 +237,29 @@ class Prepared(SearchSpace):
         See `fit_modes_of_lines`.
         """
         modal = fit_modes_of_lines(
-            self.modal[0], poles, np.sqrt(self.totals), count=count, monitor=monitor, max_iterations=max_iterations
-        )
+            self.modal[0], poles, np.sqrt(self.totals), count=count, residual=self.answers_in_band, monitor=monitor,
+            max_iterations=max_iterations,
+        )  # fmt: skip
         self.modal = (modal, *self.modal[1:])
         return modal
+
+    def fit_static(self) -> ModalEstimate:
+        """Let modes stand for all above the lines of the problem's own whole records, where these ask for it."""
+        fit = self.modal[0].record_fit
+        if fit is not None and (more := with_static_modes(fit)) is not fit:
+            self.modal = (estimate(more), *self.modal[1:])
+        return self.modal[0]
+
+    @property
+    def answers_in_band(self) -> bool:
+        """True where modes beyond the lines are no modes of the structure.
+
+        Stated entries of the mass, stated frequencies, and a mass or stiffness of a form of its own are of as many
+        modes as degrees of freedom, wherever these are.
+        """
+        mass = self.formulation.mass
+        nothing_else = mass.free and mass.entries is None and not mass.weighs
+        return nothing_else and self.formulation.stiffness.free and not self.stated.states_frequencies
 
     @cached_property
     def screened(self) -> Prepared:

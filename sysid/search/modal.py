@@ -312,7 +312,7 @@ def modal_structure(
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
-    modes, residual = _in_band(problem, end.modes)
+    modes, residual = _in_band(problem, end)
     chosen = degrees_of_freedom(problem, modes, options.sensors)
     remainder = end.rigid - modes.gamma.T @ modes.gamma
     if test.force is None:
@@ -331,17 +331,15 @@ def modal_structure(
         ) from None
 
 
-def _in_band(problem: Prepared, modes: Modes) -> tuple[Modes, ResidualModes]:
-    """The modes of the structure, and those beyond the lines, which stand for all that are there.
-
-    A lumped or known mass has as many modes as sensors, wherever they are.
-    """
-    lines = 2 * np.pi * problem.measurement.freq[[0, -1]]
-    inside = (modes.omega >= lines[0]) & (modes.omega <= lines[1])
-    if not problem.formulation.mass.free or not np.any(inside):
+def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
+    """The modes of the structure, and those beyond the lines, which stand for all that are there."""
+    (phi, gamma, omega, ratios), lines = end.modes, 2 * np.pi * problem.measurement.freq[[0, -1]]
+    inside = (omega >= lines[0]) & (omega <= lines[1])
+    if not problem.answers_in_band or not np.any(inside):
         inside[:] = True
-    phi, gamma, omega, ratios = modes
-    beyond = ResidualModes(omega[~inside] / (2 * np.pi), ratios[~inside], phi[:, ~inside], gamma[~inside])
+    beyond = ResidualModes(
+        omega[~inside] / (2 * np.pi), ratios[~inside], phi[:, ~inside], gamma[~inside], end.static
+    )  # fmt: skip
     return Modes(phi[:, inside], gamma[inside], omega[inside], ratios[inside]), beyond
 
 
@@ -358,8 +356,10 @@ def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: Iterati
             f"{modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "
             "the band, or take estimator='h1'"
         )
+    if problem.answers_in_band and options.modes is None:
+        modal = problem.fit_static()
     residual = residual_of(modal, modal.modes)
-    return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "")
+    return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "", static=modal.static)
 
 
 def held_to_totals(problem: Prepared, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
@@ -412,22 +412,27 @@ def _again(
     modes = end.modes
     first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
-    return solve_modes(
-        problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,
-        remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
+    held = first >= modes.omega.size - end.static
+    found = solve_modes(
+        problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
+        unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
         max_iterations=max_iterations,
     )  # fmt: skip
+    return replace(found, static=end.static)
 
 
-def _free_spectrum(omega: Array, ratios: Array, pole: Integers, lower: float = 0.0, upper: float = np.inf) -> Spectrum:
-    """Frequencies without bounds and damping ratios, of each pole; modes of one pole share them."""
+def _free_spectrum(
+    omega: Array, ratios: Array, pole: Integers, lower: float = 0.0, upper: float = np.inf, *, held: NDArray[np.bool_]
+) -> Spectrum:
+    """Frequencies without bounds and damping ratios, of each pole that is not held; modes of one pole share them."""
 
     def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
         # In units of the half-power half-width, which is what frequencies are known in.
         # Cut off where no step of use leads.
-        shift = _within(z.variable("frequency", np.zeros(omega.size)) * ca.DM(ratios), 1.0)
+        room = np.where(held, 0.0, np.inf)
+        shift = _within(z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios), 1.0)
         with np.errstate(divide="ignore"):
-            low, high = np.log(lower / ratios), np.log(upper / ratios)
+            low, high = (np.where(held, 0.0, np.log(limit / ratios)) for limit in (lower, upper))
         loss = _within(z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high), 10.0)
         moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
         # Entries of a scalar are a row.

@@ -90,6 +90,8 @@ def solve_modes(
     weighed = test.force is not None
     # The information of an estimate is of each of its modes apart.
     gauge, held = held_gauge(first if by_lines else first._replace(omega=np.arange(float(m))), unit, weighed)
+    if modal.static and not by_lines:  # those at one pole stay in the form that they have, without turning
+        held[-modal.static :] = (gauge[-modal.static :] == 0) | (not weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))

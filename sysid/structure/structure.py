@@ -242,8 +242,9 @@ class Structure:
         """
         lines, beyond = check_frequencies(freq, increasing=False), self.residual
         own = np.tensordot(self._coupling.T, self._relative(lines), 1)
-        others: ComplexArray = np.tensordot(beyond.participation.T, beyond.motion(lines), 1)
-        return others + own + self.rigid_body_mass[:, :, None]
+        others: ComplexArray = np.einsum("ki,kjf->ijf", beyond.participation, beyond.motion(lines))
+        others += own + self.rigid_body_mass[:, :, None]
+        return others
 
     def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Absolute accelerations of the sensors in time, under a base acceleration given by samples.

@@ -30,6 +30,9 @@ class ResidualModes:
         kg^-1/2.
     participation : (r, d)
         kg^1/2 (kg^1/2 m for a rotation of the base).
+    static : int
+        So many, the last, stand at one frequency that was chosen, not found: they hold the static answer of all modes
+        above the band.
 
     Raises
     ------
@@ -46,6 +49,7 @@ class ResidualModes:
     damping_ratios: Array
     shapes: Array
     participation: Array
+    static: int = 0
 
     def __post_init__(self) -> None:
         for name, *shape in (("natural_frequencies", "r"), ("damping_ratios", "r"), ("shapes", "n_sensors", "r"),
