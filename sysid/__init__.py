@@ -32,6 +32,7 @@ from sysid.search.strategy import History
 from sysid.search.swarm import Swarm
 from sysid.structure.sensor import rigid_body
 from sysid.structure.structure import Structure
+from sysid.structure.superelement import ResidualModes
 from sysid.swarm import SwarmSettings, minimize_swarm
 
 # CasADi 3.8 warns once about its coming NumPy conventions unless one is chosen.
@@ -60,8 +61,8 @@ def __dir__() -> list[str]:
 __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
-    "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness",
-    "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores", "Totals", "Unknown",
-    "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot", "read", "resample",
-    "rigid_body", "simulate", "time_scores", "write_report",
+    "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",
+    "SpectralStiffness", "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores",
+    "Totals", "Unknown", "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot",
+    "read", "resample", "rigid_body", "simulate", "time_scores", "write_report",
 ]  # fmt: skip

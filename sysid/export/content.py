@@ -89,6 +89,12 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         "damping acts on the motion relative to the base",
         f"precision: {precision}",
     ]
+    if structure.residual.count:
+        f = ", ".join(f"{one:.6g}" for one in structure.residual.natural_frequencies)
+        found.append(
+            f"residual modes ({f} Hz): no modes of the structure; in the band, up to {it.measurement.freq[-1]:.6g} Hz, "
+            "they answer like all modes beyond it; the Craig-Bampton form and the state space hold them, M, K, C do not"
+        )
     if it.facts.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
     return tuple(shown_plainly(" ".join(text.split())) for text in found)
@@ -103,12 +109,13 @@ def one_line_each(texts: Sequence[str], width: int, mark: str = "") -> list[str]
 
 
 def superelement_of(structure: Structure) -> CraigBampton:
-    """`Structure.to_craig_bampton` with the base first: rows and columns are of [u_0; q], all modes kept.
+    """`Structure.to_craig_bampton` with the base first: rows and columns are of [u_0; q], residual modes the last of q.
 
     No term is left out: the base is statically determinate, so that its constraint modes are the rigid-body motions,
     which strain nothing.
     """
-    form, n = structure.to_craig_bampton(), structure.n
+    form = structure.to_craig_bampton()
+    n = len(form.mass) - structure.n_base
     order = np.r_[n : n + structure.n_base, :n]
     both = np.ix_(order, order)
     return CraigBampton(form.mass[both], form.stiffness[both], form.damping[both], form.recovery[:, order])

@@ -48,13 +48,14 @@ def write_dmig(it: Identification, about: tuple[str, ...], path: Path) -> None:
     structure, axes = it.structure, it.measurement.base_axes or ()
     form = superelement_of(structure)
     base = [(BASE, BASE_AXES.index(axis) + 1) for axis in axes]
-    rows = base + [(FIRST_MODE + k, 0) for k in range(structure.n)]
+    count = len(form.mass) - structure.n_base
+    rows = base + [(FIRST_MODE + k, 0) for k in range(count)]
     sensors = [(FIRST_SENSOR + k, 0) for k in range(structure.n_sensors)]
     fixed = "".join(str(c + 1) for c, axis in enumerate(BASE_AXES) if axis not in axes)
     lines = [
         *one_line_each((*about, *_usage(it)), 72, "$ "),
         f"GRID,{BASE},,0.,0.,0.,,{fixed}".rstrip(","),
-        f"SPOINT,{FIRST_MODE},THRU,{FIRST_MODE + structure.n - 1}" if structure.n > 1 else f"SPOINT,{FIRST_MODE}",
+        f"SPOINT,{FIRST_MODE},THRU,{FIRST_MODE + count - 1}" if count > 1 else f"SPOINT,{FIRST_MODE}",
         *_matrix("MCB", form.mass, rows, rows, _SYMMETRIC),
         *_matrix("KCB", form.stiffness, rows, rows, _SYMMETRIC),
         *_matrix("BCB", form.damping, rows, rows, _SYMMETRIC),
@@ -69,7 +70,7 @@ def _usage(it: Identification) -> list[str]:
         "the matrices below are not those of the order above but the Craig-Bampton form: "
         f"grid point {BASE} is the base (give it the coordinates of the point that base motion and moments refer to), "
         f"scalar points from {FIRST_MODE} on are the coordinates of the mass-normalised modes on a fixed base, "
-        "in ascending order of frequency",
+        "in ascending order of frequency, those of residual modes, where there are any, last",
         "case control: M2GG = MCB, K2GG = KCB, B2GG = BCB",
         "RCB takes base and modal coordinates to the absolute motion of the sensors; its rows: " + ", ".join(names),
     ]

@@ -40,14 +40,18 @@ def write_matlab(it: Identification, about: tuple[str, ...], path: Path) -> None
     """Write M, K, C with deviations, modes, state space, names, and `about`: what the file says of itself, in lines.
 
     `G` (n_sensors, d): rigid-body motion of the sensors; `f_hz`, `zeta` (m, 1), `Phi` (n_sensors, m), `Gamma` (m, d):
-    modes on the fixed base, mass-normalised; `A`, `B`, `Cy`, `D`: from base acceleration to absolute acceleration of
-    the sensors; `recovery` (n_sensors, n): degrees of freedom to sensors.
+    modes on the fixed base, mass-normalised; `f_hz_residual` and so on (r of them): residual modes, beside; `A`, `B`,
+    `Cy`, `D`: from base acceleration to absolute acceleration of the sensors, residual modes included; `recovery`
+    (n_sensors, n): degrees of freedom to sensors.
     """
     s, system = it.structure, it.structure.to_state_space()
+    beyond = s.residual
     variables = {
         **matrices_of(s), **{f"{letter}_std": std for letter, std in deviations_of(it).items()},
         "G": s.rigid_body, "recovery": s.recovery, "f_hz": s.natural_frequencies[:, None],
         "zeta": s.damping_ratios[:, None], "Phi": s.mode_shapes, "Gamma": s.participation,
+        "f_hz_residual": beyond.natural_frequencies[:, None], "zeta_residual": beyond.damping_ratios[:, None],
+        "Phi_residual": beyond.shapes, "Gamma_residual": beyond.participation,
         "A": system.A, "B": system.B, "Cy": system.C, "D": system.D,
         "determined": it.determined, "success": it.success,
         "dof_names": _cells(names_of(it)), "sensor_names": _cells(it.measurement.sensor_names),

@@ -92,7 +92,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     See `ModeFit.with_static` of spectra.
     """
     test, p, d = fit.test, fit.parameters, fit.test.n_base
-    if fit.static or fit.stopped or not fit.settled:
+    if fit.static or fit.stopped:
         return fit
     worth, rise = _rise(fit)
     if worth < beyond_chance(rise.size):
@@ -122,7 +122,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
 
 
 def _rise(fit: RecordFit) -> tuple[float, Array]:
-    """Chi-squared of what grows as w² in the sensors, which all of a fit follows; its size where nothing does, (n, d)."""
+    """Chi-squared of what grows as w² in the sensors, which a fit follows; its size where none does, (n, d)."""
     (n, d), at, equations = fit.test.rigid_body.shape, fit.model.size, fit.equations
     asked = slice(at + n * d, at + 2 * n * d)
     seen = np.r_[np.arange(at), np.arange(asked.start, asked.stop)]

@@ -135,7 +135,7 @@ class SpectraModel(SpectralModel):
         for (i, j), value in zip(self.index.pairs, corner, strict=False):
             rigid[i, j] = rigid[j, i] = value
         with np.errstate(over="ignore"):
-            omega, ratios = np.exp(log_omega), np.exp(np.maximum(log_ratios, -FAR))
+            omega, ratios = np.exp(np.maximum(log_omega, -FAR)), np.exp(np.maximum(log_ratios, -FAR))
         return self.with_best_shapes(Modes(np.zeros((self.n, self.m)), gamma.reshape(self.m, -1), omega, ratios), rigid)
 
     def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:

@@ -92,6 +92,8 @@ class ModeFit:
     unit: Array
     monitor: IterationMonitor
     max_iterations: int
+    static: int = 0
+    """So many modes, all at the last pole, which is held: see `ModalFit`."""
 
     @cached_property
     def records(self) -> Records:
@@ -124,25 +126,43 @@ class ModeFit:
         """The fit, with as many modes as base directions at a far pole, held, where it leaves what modes above add.
 
         Their answer is theirs at low frequency, of all together, with a mass that is positive: what is left grows as
-        w². Free poles that are as far give way.
+        w². So it is where poles above the lines, next to exchangeable, came to no end. Those as far give way, and so do
+        poles, and second modes at a pole, that stood for what these modes explain.
         """
         test, (_, d) = self.test, self.test.rigid_body.shape
-        if not self._goes_on or not self._misses_static(best):
+        if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
             return best
-        times, ratio = STATIC_POLE
-        far = times * 2 * np.pi * float(test.freq[-1])
-        first, pole = separate_poles(best.modes)
-        near = best.modes.omega[first] < (1 + times) / 2 / times * far
-        omega, ratios = (np.append(part[first][near], one) for part, one in
-                         ((best.modes.omega, far), (best.modes.ratios, ratio)))  # fmt: skip
-        poles, counts = replace(self.poles, omega=omega, ratios=ratios), np.append(np.bincount(pole)[near], d)
-        more = replace(self, poles=poles).of_modes(counts, static=d)
+        (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
+        first = separate_poles(best.modes)[0]
+        found, near = best.modes.omega[first], best.modes.omega[first] < (1 + times) / 2 * last
+        omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
+        kept = self._worthwhile(omega, ratios)
+        omega, ratios = omega[kept], ratios[kept]
+        fit, counts = (
+            replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=d),
+            np.ones(kept.size, int),
+        )
+        counts[-1] = d
+        more = fit._grown(fit.of_modes(counts), counts)
+        inside = np.count_nonzero(omega < last), np.count_nonzero(np.unique(more.modes.omega) < last)
+        if more.status != "settled" or inside[0] != inside[1]:  # a pole that comes into the lines is no mode
+            return best
         unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
         gained = (best.residual**2 - more.residual**2) * self.records.size
-        noise = self._free(more, counts)[1]
-        inside = [np.count_nonzero(one.modes.omega < 2 * np.pi * test.freq[-1]) for one in (best, more)]
-        lost = inside[0] != inside[1]  # a pole that comes into the lines is no mode
-        return best if lost or gained < noise * beyond_chance(max(unknowns, 1)) else more
+        free = self.records.fit(omega, ratios)
+        noise = self.records.noise(free.left, free.residues.size)
+        return more if gained > np.sign(unknowns) * beyond_chance(max(abs(unknowns), 1)) * noise else best
+
+    def _worthwhile(self, omega: Array, ratios: Array) -> Integers:
+        """Poles that noise does not explain beside the last one: some stood for what that explains."""
+        subsets, kept = SubsetFits(self.records, omega, ratios), np.arange(omega.size)
+        while kept.size > 1:
+            worth, _ = subsets.worth(kept)
+            least = int(np.argmin(worth[:-1]))
+            if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
+                break
+            kept = np.delete(kept, least)
+        return kept
 
     def _misses_static(self, best: ModalFit) -> bool:
         """True where what free residues leave at the poles of a fit grows as w², beyond chance."""
@@ -236,8 +256,8 @@ class ModeFit:
         left[multiplicity >= min(n, d)] = 0.0
         return int(np.argmax(left)) if left.max() > 0 else None
 
-    def of_modes(self, multiplicity: Integers, *, static: int = 0) -> ModalFit:
-        """Fit with so many modes at each pole, from its free residue's largest singular values; `static` as above."""
+    def of_modes(self, multiplicity: Integers) -> ModalFit:
+        """Fit with so many modes at each pole, from its free residue's largest singular values."""
         test, poles, unit = self.test, self.poles, self.unit
         residues, _ = linear_residues(test, poles.omega, poles.ratios)
         pole = np.repeat(np.arange(poles.omega.size), multiplicity)
@@ -251,5 +271,5 @@ class ModeFit:
             t, rigid = weigh(test, modes)
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         return fit_spectra(
-            test, modes, rigid, static=static, monitor=self.monitor, max_iterations=self.max_iterations
+            test, modes, rigid, static=self.static, monitor=self.monitor, max_iterations=self.max_iterations
         )  # fmt: skip

@@ -333,14 +333,19 @@ def modal_structure(
 
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     """The modes of the structure, and those beyond the lines, which stand for all that are there."""
-    (phi, gamma, omega, ratios), lines = end.modes, 2 * np.pi * problem.measurement.freq[[0, -1]]
-    inside = (omega >= lines[0]) & (omega <= lines[1])
-    if not problem.answers_in_band or not np.any(inside):
-        inside[:] = True
+    phi, gamma, omega, ratios = end.modes
+    inside = _inside(problem, omega)
     beyond = ResidualModes(
         omega[~inside] / (2 * np.pi), ratios[~inside], phi[:, ~inside], gamma[~inside], end.static
     )  # fmt: skip
     return Modes(phi[:, inside], gamma[inside], omega[inside], ratios[inside]), beyond
+
+
+def _inside(problem: Prepared, omega: Array) -> NDArray[np.bool_]:
+    """True for modes of the structure: those within the lines, or all where it has them wherever they are, (m,)."""
+    lines = 2 * np.pi * problem.measurement.freq[[0, -1]]
+    inside = (omega >= lines[0]) & (omega <= lines[1])
+    return inside if problem.answers_in_band and np.any(inside) else np.ones(omega.size, bool)
 
 
 def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
@@ -412,7 +417,8 @@ def _again(
     modes = end.modes
     first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
-    held = first >= modes.omega.size - end.static
+    # Poles beyond the lines mean nothing by themselves, and several may be next to exchangeable.
+    held = ~_inside(problem, modes.omega[first])
     found = solve_modes(
         problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
         unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,

@@ -365,9 +365,7 @@ class Structure:
         acceleration = np.hstack([-spring, -loss])
         feed = -np.vstack([M_inv @ self._coupling, beyond.participation])
         A = np.vstack([np.hstack([np.zeros_like(spring), np.eye(len(spring))]), acceleration])
-        return StateSpace(
-            A, np.vstack([np.zeros((n, self.n_base)), feed]), R @ acceleration, R @ feed + self.rigid_body
-        )
+        return StateSpace(A, np.vstack([np.zeros_like(feed), feed]), R @ acceleration, R @ feed + self.rigid_body)
 
     def to_craig_bampton(self, *, residual_vectors: bool = True) -> CraigBampton:
         """Fixed-base modal coordinates, those of residual modes last, beside the base's own degrees of freedom.

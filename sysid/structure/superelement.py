@@ -63,6 +63,7 @@ class ResidualModes:
             ),
             (np.any(self.natural_frequencies <= 0), "the frequency of a residual mode is not positive"),
             (np.any(self.damping_ratios < 0), "the damping ratio of a residual mode is negative"),
+            (not 0 <= self.static <= self.count, f"{self.static} of {self.count} residual modes cannot be static"),
         )
 
     @classmethod

@@ -47,8 +47,8 @@ def test_a_sensor_that_is_the_mean_of_two_others_is_no_degree_of_freedom(random_
     force = test.force + draw(test.force.shape, np.sqrt(np.mean(np.abs(test.force) ** 2) / 2))
     dependent = Measurement(freq, test.base, response + draw(response.shape, size), rigid_body=G, force=force)
     result = identify(Problem(dependent, mass=FullMass()), rng=0)
-    assert not result.determined
-    assert any("independently" in one.sentence for one in result.of_kind("open"))
+    # Three sensors and a modal coordinate, which the force fixes all the same.
+    assert result.determined and np.count_nonzero(result.structure.dof_modes >= 0) == 1
     assert result.residual < 1.1 * noise + 1e-9
     assert np.linalg.cond(result.structure.mass[:4, :4]) < 1e6
 

@@ -177,28 +177,31 @@ def test_what_transients_take_off_the_information_is_as_they_move_along(force: b
 
 @pytest.mark.parametrize("d", [1, 2])
 def test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_lines(d: int) -> None:
-    """A share e of the base's motion is a change of G by e; a mode at W far above the lines adds e w² for ``e W²``."""
+    """A share e of the base's motion is a change of G by e; a mode at W far above the lines adds e w² for ``e W²``.
+
+    The third kind is a mode without damping at 1.3 times the last line.
+    """
     model, p, levels = _model(False, d)
     n, fit = model.n, RecordModel(model.test, 2, gains=True)
-    gradient = fit.normal_equations(p, levels).gradient[fit.n_fit :].reshape(2, n, d)
+    gradient = fit.normal_equations(p, levels).gradient[fit.n_fit :].reshape(3, n, d)
     h, last, far = 1e-5, 2 * np.pi * model.test.freq[-1], 1e4
-    more = RecordModel(model.test, 3)
+    more = RecordModel(model.test, 4)
 
-    def left(i: int, j: int, share: float, rising: float) -> float:
+    def left(i: int, j: int, share: float, rising: float, above: float) -> float:
         G = model.test.rigid_body.copy()
         G[i, j] += share
-        phi, gamma = rising * np.eye(n)[:, [i]], far**2 * np.eye(d)[[j]]
+        phi, gamma = np.eye(n)[:, [i, i]] * [rising, above], np.eye(d)[[j, j]] * [[far**2], [1.0]]
         modes = Modes(
-            np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, gamma]), np.append(p.modes.omega, far * last),
-            np.append(p.modes.ratios, 1e-6),
+            np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, gamma]),
+            np.append(p.modes.omega, [far * last, 1.3 * last]), np.append(p.modes.ratios, [1e-6, 0.0]),
         )  # fmt: skip
-        every = Parameters(modes, p.rigid, np.vstack([p.ends, np.zeros((1, p.ends.shape[1]))]), p.traces)
+        every = Parameters(modes, p.rigid, np.vstack([p.ends, np.zeros((2, p.ends.shape[1]))]), p.traces)
         more.test = replace(model.test, rigid_body=G)
         return _dense_chi2(more, every, levels)
 
     for i, j in np.ndindex(n, d):
-        for kind, step in enumerate(((h, 0.0), (0.0, h))):
-            slope = (left(i, j, *step) - left(i, j, *(-one for one in step))) / (2 * h)
+        for kind, step in enumerate(h * np.eye(3)):
+            slope = (left(i, j, *step) - left(i, j, *-step)) / (2 * h)
             assert -2 * gradient[kind, i, j] == pytest.approx(slope, rel=1e-4, abs=1e-4 * np.abs(gradient).max())
 
 

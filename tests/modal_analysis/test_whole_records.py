@@ -115,4 +115,4 @@ def test_motion_with_the_base_is_judged_beside_its_noise(records, gain):
     )
     chi2 = gain_errors_of(whole_fit(test)).rigid_chi2
     assert np.all(chi2[1:] < 30)  # of three degrees of freedom
-    assert chi2[0] > 1000 if gain != 1 else chi2[0] < 30
+    assert chi2[0] > 300 if gain != 1 else chi2[0] < 30  # beside what modes above the lines may add

@@ -1,0 +1,172 @@
+"""Modes above the lines, standing for all there together, against the sums over the true modes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.records.simulated import Modes as SimulatedModes
+from benchmarks.records.simulated import Run, random_motion, with_noise
+from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.model_order import with_static_modes
+from sysid.modal_analysis.record_model import RecordModel
+from sysid.structure.structure import Structure
+
+
+@pytest.fixture(scope="module")
+def truth(random_structure):
+    """Ten modes, of which six are far above the lines: no pole is found there."""
+    frequencies = np.array([4.0, 6.5, 9.0, 12.0, 45.0, 60.0, 70.0, 85.0, 100.0, 120.0])
+    return random_structure(np.random.default_rng(4), 10, 2, frequencies=frequencies, base_mass=1.0)
+
+
+@pytest.fixture(scope="module")
+def spectra(truth):
+    """Half a per cent of noise, lines up to the fourth mode."""
+    return sysid.simulate(truth, np.linspace(2.0, 15.0, 400), noise=0.005, force=True, rng=0)
+
+
+@pytest.fixture(scope="module")
+def found(spectra):
+    return sysid.identify(sysid.Problem(spectra, mass=sysid.FullMass()), rng=0)
+
+
+def low(structure, freq):
+    """The part in phase of what residual modes add, over w², at a line."""
+    beyond, w = structure.residual, 2 * np.pi * freq
+    motion = beyond.motion(np.array([freq]))[..., 0].real / w**2
+    return beyond.shapes @ motion, beyond.participation.T @ motion
+
+
+def test_they_stand_for_all_modes_above_the_lines(truth, found):
+    s, f, outside = found.structure, np.array([13.0]), truth.natural_frequencies > 15.0
+    all_there = sysid.ResidualModes(
+        truth.natural_frequencies[outside], truth.damping_ratios[outside], truth.mode_shapes[:, outside],
+        truth.participation[outside],
+    )  # fmt: skip
+    w = 2 * np.pi * f[0]
+    motion = all_there.motion(f)[..., 0].real / w**2
+    expected = all_there.shapes @ motion, all_there.participation.T @ motion
+    # Of the force they make a small part, which noise of its own size hides more of.
+    for mine, right, within in zip(low(s, f[0]), expected, (0.05, 0.15), strict=True):
+        assert np.abs(mine - right).max() < within * np.abs(right).max()
+    assert s.residual.static == 2 and np.allclose(s.residual.natural_frequencies[-2:], 30.0)
+
+
+def test_the_modes_in_the_lines_are_determined_within_their_deviations(truth, found):
+    u, inside = found.uncertainty, truth.natural_frequencies < 15.0
+    assert found.determined and found.structure.n == 4 and not found.contradictions
+    for name in ("natural_frequencies", "damping_ratios"):
+        off = (getattr(found.structure, name) - getattr(truth, name)[inside]) / getattr(u, name)
+        assert np.sqrt(np.mean(off**2)) < 2.5 and np.abs(off).max() < 4.5
+    off = (found.structure.effective_masses - truth.effective_masses[inside]) / u.effective_masses
+    assert np.abs(off).max() < 4
+
+
+def test_no_mass_of_the_superelement_is_negative(found):
+    mass = found.structure.to_craig_bampton().mass
+    size = np.sqrt(np.diag(mass))
+    assert np.linalg.eigvalsh(mass / np.outer(size, size))[0] > -1e-9
+
+
+def test_deviations_are_those_of_a_dense_jacobian_with_the_far_pole_held(spectra, found):
+    """By complex steps of the response, the pole of the static modes no unknown; a pseudo-inverse leaves the gauge."""
+    s, freq, d = found.structure, spectra.freq, 2
+    beyond, n = s.residual, s.n_sensors
+    m, r = s.n, beyond.count
+    omega = np.concatenate([2 * np.pi * s.natural_frequencies, beyond.omega])
+    ratios = np.concatenate([s.damping_ratios, beyond.damping_ratios])
+    free = m + r - beyond.static
+    theta = np.concatenate([
+        np.log(omega[:free]), np.log(ratios[:free]), np.hstack([s.mode_shapes, beyond.shapes]).ravel(),
+        np.vstack([s.participation, beyond.participation]).ravel(), s.rigid_body_mass[np.triu_indices(d)],
+    ])  # fmt: skip
+    sizes = np.cumsum([free, free, n * (m + r), (m + r) * d])
+
+    def records(x):
+        """Real and imaginary parts as real-analytic functions of x, accelerations and force of both runs."""
+        log_w, log_z, phi, gamma, corner = np.split(x, sizes)
+        phi, gamma = phi.reshape(n, -1), gamma.reshape(-1, d)
+        w_k = np.concatenate([np.exp(log_w), omega[free:]])[:, None]
+        z_k = np.concatenate([np.exp(log_z), ratios[free:]])[:, None]
+        w = 2 * np.pi * freq
+        a, b = w_k**2 - w**2, 2 * z_k * w_k * w
+        parts = np.stack([w**2 * a, -(w**2) * b]) / (a**2 + b**2)
+        M = np.array([[corner[0], corner[1]], [corner[1], corner[2]]])
+        of_a = np.einsum("nk,kd,pkf->pndf", phi, gamma, parts)
+        of_f = np.einsum("kc,kd,pkf->pcdf", gamma, gamma, parts)
+        of_f[0] += M[:, :, None]
+        return [one.transpose(1, 0, 2, 3).reshape(len(one[0]), -1) for one in (of_a, of_f)]
+
+    step = 1e-20j
+    columns = [records(theta + step * one) for one in np.eye(theta.size)]
+    stds = []
+    for record, std in ((spectra.response, spectra.response_std), (spectra.force, spectra.force_std)):
+        left = record - (spectra.predict(s) + record - spectra.relative if record is spectra.response
+                         else spectra.predict_force(s))  # fmt: skip
+        stds.append(np.sqrt(np.mean(np.abs(left) ** 2) / 2) if std is None else std.ravel()[0] / np.sqrt(2))
+    J = np.stack([np.concatenate([c.imag.ravel() / 1e-20 / std for c, std in zip(col, stds, strict=True)])
+                  for col in columns], axis=1)  # fmt: skip
+    size = np.linalg.norm(J, axis=0)
+    covariance = np.linalg.pinv((J / size).T @ (J / size), rcond=1e-10, hermitian=True) / np.outer(size, size)
+    right = np.sqrt(np.diag(covariance))
+    u = found.uncertainty
+    np.testing.assert_allclose(u.natural_frequencies / s.natural_frequencies, right[:m], rtol=0.03)
+    np.testing.assert_allclose(u.damping_ratios / s.damping_ratios, right[free : free + m], rtol=0.03)
+
+
+@pytest.fixture(scope="module")
+def whole(truth):
+    """A record cut in motion, its lines up to the fourth mode; sampled far above all modes."""
+    rng = np.random.default_rng(2)
+    motion = random_motion(rng, 30.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
+    records, _ = with_noise(Run.ringing(SimulatedModes.of(truth), motion, rng).records(), rng, 0.02)
+    return sysid.Measurement.from_time(
+        [(records.base, records.response, records.force)], 200.0, rigid_body=truth.rigid_body, band=(2.0, 15.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def fits(whole):
+    """Of whole records, without them and with them."""
+    fit = whole_fit(whole)
+    return fit, with_static_modes(fit)
+
+
+def test_whole_records_ask_for_them_too(truth, whole, fits):
+    fit, more = fits
+    assert more.static == 2 and 2 * (more.likelihood - fit.likelihood) > 100
+    at = np.argsort(more.parameters.modes.omega)[:4]
+    information = more.information()
+    found = more.parameters.modes.omega[at] / (2 * np.pi)
+    assert np.abs(found / truth.natural_frequencies[:4] - 1).max() < 1e-3 and information.shape[0]
+    result = sysid.identify(sysid.Problem(whole, mass=sysid.FullMass()), rng=0)
+    off = (result.structure.damping_ratios - truth.damping_ratios[:4]) / result.uncertainty.damping_ratios
+    assert result.determined and np.abs(off).max() < 4
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_the_unknowns_of_a_model_with_them_are_what_its_normal_matrix_holds(whole, fits, force):
+    """Its rank: without the far pole, transients of these modes, turns among them and, without a force, scales."""
+    fit, n = fits[1], whole.n_sensors
+    test, parameters, levels = whole, fit.parameters, fit.levels
+    if not force:
+        test, parameters = replace(whole, force=None), replace(parameters, traces=parameters.traces[:, :n])
+        levels = np.delete(levels, [n, n + 1], axis=1)
+    model = RecordModel(test, fit.model.m, static=2)
+    equations = model.normal_equations(parameters, levels)
+    assert not np.any(equations.gradient[model.held])
+    size = np.sqrt(np.diag(equations.normal))
+    seen = size > 0
+    scaled = equations.normal[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
+    lam = np.linalg.eigvalsh(scaled)
+    assert np.count_nonzero(lam > 1e-12 * lam[-1]) == model.unknowns
+
+
+def test_a_structure_without_modes_above_has_none(random_structure):
+    truth = random_structure(np.random.default_rng(5), 4, 2, frequencies=[4.0, 6.5, 9.0, 12.0])
+    test = sysid.simulate(truth, np.linspace(2.0, 15.0, 300), noise=0.01, force=True, rng=1)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    assert isinstance(result.structure, Structure) and result.structure.residual.count == 0
+    assert result.structure.at_sensors and result.determined
