@@ -41,3 +41,12 @@ def noisy():
         mass = sysid.FullMass() if force else sysid.FullMass(50.0)
         found.append(sysid.identify(sysid.Problem(test, mass=mass, damping=sysid.ModalDamping())))
     return truth, *found
+
+
+@pytest.fixture(scope="session")
+def in_band(random_structure) -> sysid.Identification:
+    """Four modes in the lines on six sensors; the two above are residual modes."""
+    frequencies = [8.0, 13.0, 19.0, 26.0, 44.0, 52.0]
+    truth = random_structure(np.random.default_rng(8), 6, 2, frequencies=np.array(frequencies), base_mass=1.0)
+    test = sysid.simulate(truth, np.linspace(4.0, 32.0, 300), force=True, noise=0.002, rng=0)
+    return sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.io
 
 import sysid
 from sysid.export.state_space import control_system
@@ -74,6 +75,41 @@ def test_a_dmig_deck_keeps_ten_digits_and_answers_as_identified(result, tmp_path
     assert_answers_alike(result.structure, base_driven(M, C, K, R, 2), 1e-6)
     text = path.read_text()
     assert "$ judgement: determined" in text and max(map(len, text.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("file", ["m.op4", "m.bdf", "m.mat"])
+def test_files_of_an_answer_in_the_band_hold_its_residual_modes(in_band, tmp_path, file):
+    s, path = in_band.structure, tmp_path / file
+    assert in_band.determined and (s.n, s.n_sensors) == (4, 6) and s.residual.count
+    q = [1001 + k for k in range(4 + s.residual.count)]
+    if file == "m.mat":
+        read = scipy.io.loadmat(sysid.export(in_band, path))
+        system = [read[name] for name in ("A", "B", "Cy", "D")]
+        answer = [system[2] @ np.linalg.solve(2j * np.pi * f * np.eye(2 * len(q)) - system[0], system[1]) + system[3]
+                  for f in FREQ]  # fmt: skip
+        right = s.transmissibility(FREQ)
+        assert np.abs(np.stack(answer, axis=-1) - right).max() < 1e-8 * np.abs(right).max()
+        assert np.array_equal(read["f_hz_residual"][:, 0], s.residual.natural_frequencies)
+    elif file == "m.op4":
+        read = pytest.importorskip("pyyeti.nastran.op4").read(str(sysid.export(in_band, path)))
+        assert_answers_alike(s, base_driven(read["mcb"], read["ccb"], read["kcb"], read["rcb"], 2), 1e-9)
+    else:
+        read = pytest.importorskip("pyyeti.nastran.bulk").rddmig(str(sysid.export(in_band, path)))
+        points = [(1, 1), (1, 2), *((point, 0) for point in q)]
+        K, M, C = (
+            read[key].reindex(index=points, columns=points).fillna(0).to_numpy() for key in ("kcb", "mcb", "bcb")
+        )
+        R = read["rcb"].reindex(columns=points).fillna(0).to_numpy()
+        assert_answers_alike(s, base_driven(M, C, K, R, 2), 1e-6)
+        assert "residual modes" in " ".join(path.read_text().replace("$", "").split())
+
+
+def test_a_stored_answer_in_the_band_keeps_its_residual_modes(in_band, tmp_path):
+    again = sysid.load(in_band.save(tmp_path / "result.h5"))
+    assert np.array_equal(again.structure.base_force(FREQ), in_band.structure.base_force(FREQ))
+    assert again.judgement == in_band.judgement == "determined"
+    u, v = again.uncertainty, in_band.uncertainty
+    np.testing.assert_allclose(u.mass, v.mass, rtol=1e-6)
 
 
 def test_a_universal_file_keeps_modes_to_1e_5(result, tmp_path):
