@@ -31,7 +31,7 @@ UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
-_RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
+_RESOLVED = 5.0  # standard deviations of a mode's amplitude, at which deviations tell how well it is known
 _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
 
 

@@ -99,8 +99,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
         return fit
     times, ratio = STATIC_POLE
     far = times * 2 * np.pi * float(test.freq[-1])
-    near = p.modes.omega < (1 + times) / 2 / times * far
-    p = without(fit, ~near)
+    p = without(fit, p.modes.omega >= far)
     if fit.model.force:
         spare = np.diag(p.rigid - p.modes.gamma.T @ p.modes.gamma)
         gamma = np.sqrt(_LIGHT * np.maximum(spare, _LIGHT * np.diag(p.rigid)))

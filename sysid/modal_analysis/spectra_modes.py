@@ -134,7 +134,7 @@ class ModeFit:
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
         first = separate_poles(best.modes)[0]
-        found, near = best.modes.omega[first], best.modes.omega[first] < (1 + times) / 2 * last
+        found, near = best.modes.omega[first], best.modes.omega[first] < times * last
         omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
         kept = self._worthwhile(omega, ratios)
         omega, ratios = omega[kept], ratios[kept]
