@@ -28,7 +28,7 @@ CEILINGS = {
     # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340),
     # and fits that end when they are asked to, with the best so far, which results hold (400),
     # and transients of runs eliminated run by run, noise levels and further modes of low rank (210).
-    "lines": 39_884,
+    "lines": 40_350,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

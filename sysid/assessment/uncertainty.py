@@ -227,7 +227,7 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
-    mine = Modes(modes.phi[:, own], modes.gamma[own], modes.omega[own], modes.ratios[own])
+    mine = modes.at(own)
     matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, mine, moves.of(own))]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
@@ -364,12 +364,12 @@ def separated_modes(structure: Structure) -> Modes:
 def _all_modes(structure: Structure) -> Modes:
     """`separated_modes` with the residual ones among them, ascending."""
     own, beyond = separated_modes(structure), structure.residual
-    omega = np.concatenate([own.omega, beyond.omega])
-    order = np.argsort(omega, kind="stable")
-    return Modes(
-        np.hstack([own.phi, beyond.shapes])[:, order], np.vstack([own.gamma, beyond.participation])[order],
-        omega[order], np.concatenate([own.ratios, np.maximum(beyond.damping_ratios, NEGLIGIBLE)])[order],
+    every = Modes(
+        np.hstack([own.phi, beyond.shapes]), np.vstack([own.gamma, beyond.participation]),
+        np.concatenate([own.omega, beyond.omega]),
+        np.concatenate([own.ratios, np.maximum(beyond.damping_ratios, NEGLIGIBLE)]),
     )  # fmt: skip
+    return every.at(np.argsort(every.omega, kind="stable"))
 
 
 def _quantities(

@@ -258,7 +258,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     ])  # fmt: skip
     return ModalEstimate(
         fit.test, without_transients(fit),
-        modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
+        *modes.at(order), p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -27,6 +27,10 @@ class Modes(NamedTuple):
     gamma: Array
     omega: Array
     ratios: Array
+
+    def at(self, which: NDArray[Any] | slice) -> Modes:
+        """Some of the modes, or all in another order, by flags or numbers."""
+        return Modes(self.phi[:, which], self.gamma[which], self.omega[which], self.ratios[which])
 
 
 def separate_poles(modes: Modes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

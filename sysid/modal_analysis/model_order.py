@@ -137,7 +137,7 @@ def _rise(fit: RecordFit) -> tuple[float, Array]:
 def _in_gauge(fit: RecordFit) -> RecordFit:
     """The same fit, its static modes turned into each other to the form that `held_gauge` keeps."""
     p, d = fit.parameters, fit.static
-    last = Modes(p.modes.phi[:, -d:], p.modes.gamma[-d:], p.modes.omega[-d:], p.modes.ratios[-d:])
+    last = p.modes.at(slice(-d, None))
     gauge = held_gauge(last, np.ones(d), fit.model.force)[0]
     phi = last.phi @ last.gamma @ np.linalg.inv(gauge)
     modes = p.modes._replace(

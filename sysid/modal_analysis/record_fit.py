@@ -392,8 +392,7 @@ def _rough_levels(model: RecordModel, p: Parameters) -> Array:
 def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
     """Parameters of a fit without some modes, (m,)."""
     p, keep = fit.parameters, ~gone
-    modes = Modes(p.modes.phi[:, keep], p.modes.gamma[keep], p.modes.omega[keep], p.modes.ratios[keep])
-    return replace(p, modes=modes, ends=p.ends[keep])
+    return replace(p, modes=p.modes.at(keep), ends=p.ends[keep])
 
 
 def worth(fit: RecordFit, normal: Array | None = None) -> Array:

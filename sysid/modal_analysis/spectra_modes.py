@@ -72,9 +72,7 @@ def fit_modes_of_lines(
     found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
     if residual and count is None:
         found = fit.with_static(found)
-    phi, gamma, omega, ratios = found.modes
-    order = np.argsort(omega, kind="stable")
-    modes = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
+    modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
     )  # fmt: skip

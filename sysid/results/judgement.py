@@ -174,7 +174,7 @@ def _structure(problem: Prepared, first: Structure, before: Array, after: Array,
     omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - omega_before)
     ratios = first.damping_ratios * np.exp(log_ratios - ratios_before)
     order = np.argsort(omega, kind="stable")
-    end = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
+    end = Modes(phi, gamma, omega, ratios).at(order)
     geometry, P, G = problem.geometry, np.linalg.inv(end.phi), problem.geometry.rigid_body
     if problem.measurement.force is None:
         groups = geometry.directions[: geometry.n]

@@ -333,18 +333,16 @@ def modal_structure(
 
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     """The modes of the structure, and those beyond the lines, which stand for all that are there."""
-    phi, gamma, omega, ratios = end.modes
-    inside = _inside(problem, omega)
-    beyond = ResidualModes(
-        omega[~inside] / (2 * np.pi), ratios[~inside], phi[:, ~inside], gamma[~inside], end.static
-    )  # fmt: skip
-    return Modes(phi[:, inside], gamma[inside], omega[inside], ratios[inside]), beyond
+    inside = _inside(problem, end.modes.omega)
+    others = end.modes.at(~inside)
+    residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, end.static)
+    return end.modes.at(inside), residual
 
 
 def _inside(problem: Prepared, omega: Array) -> NDArray[np.bool_]:
     """True for modes of the structure: those within the lines, or all where it has them wherever they are, (m,)."""
-    lines = 2 * np.pi * problem.measurement.freq[[0, -1]]
-    inside = (omega >= lines[0]) & (omega <= lines[1])
+    first, last = 2 * np.pi * problem.measurement.freq[[0, -1]]
+    inside = (omega >= first) & (omega <= last)
     return inside if problem.answers_in_band and np.any(inside) else np.ones(omega.size, bool)
 
 
