@@ -35,10 +35,10 @@ def mast():
     )  # fmt: skip
 
 
-def problem(*, data=None, rng=0, noise=0.005, force=True):
+def problem(*, data=None, rng=0, noise=0.005, force=True, modes=4):
     if data is not None:
         raise sysid.InputError("cantilever_in_band is simulated and takes no --data")
     truth = mast()
     f = truth.natural_frequencies
-    freq = np.linspace(0.4 * f[0], f[3] + (f[4] - f[3]) / 3, 400)
+    freq = np.linspace(0.4 * f[0], f[modes - 1] + (f[modes] - f[modes - 1]) / 3, 400)
     return sysid.Problem(sysid.simulate(truth, freq, noise=noise, force=force, rng=rng), mass=sysid.FullMass())

@@ -40,10 +40,15 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
     _casadi.GlobalOptions.setNumpyMode(-1)  # as it always was, without the warning
 
 if _TYPE_CHECKING:
-    from sysid import jobs, plot
+    from sysid import catalogue, jobs, plot
     from sysid.report.report import write_report
 
-_FIRST_USED = {"jobs": "sysid.jobs", "plot": "sysid.plot", "write_report": "sysid.report.report"}
+_FIRST_USED = {
+    "catalogue": "sysid.catalogue",
+    "jobs": "sysid.jobs",
+    "plot": "sysid.plot",
+    "write_report": "sysid.report.report",
+}
 
 
 def __getattr__(name: str) -> _Any:
@@ -63,6 +68,6 @@ __all__ = [
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",
     "SpectralStiffness", "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores",
-    "Totals", "Unknown", "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot",
-    "read", "resample", "rigid_body", "simulate", "time_scores", "write_report",
+    "Totals", "Unknown", "Variable", "__version__", "catalogue", "export", "identify", "jobs", "load",
+    "minimize_swarm", "plot", "read", "resample", "rigid_body", "simulate", "time_scores", "write_report",
 ]  # fmt: skip
