@@ -46,7 +46,7 @@ def spread_points(formulation: Formulation, count: int, rng: np.random.Generator
     rows = low + unit * (high - low)
     s = ca.MX.sym("s", formulation.size)
     unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
-    return [np.asarray(unknowns(row)).ravel() for row in rows]
+    return list(np.asarray(unknowns(rows.T)).T)  # a column each
 
 
 def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
@@ -410,7 +411,11 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
         low = high = np.atleast_1d(np.array(stated, dtype=float))
         what = "the stated natural frequencies are"
     else:
-        frequencies = [s.natural_frequencies for s in _structures(declared)]
+        frequencies = []
+        for structure in _structures(declared):
+            frequencies.append(structure.natural_frequencies)
+            if found[0] <= MISFIT * frequencies[-1][0]:  # as right lines are at once: nothing more to look at
+                return
         if not frequencies:
             return
         low, high = np.min(frequencies, axis=0), np.max(frequencies, axis=0)
@@ -435,7 +440,7 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
         )  # fmt: skip
 
 
-def _structures(declared: Formulation) -> list[Structure]:
+def _structures(declared: Formulation) -> Iterator[Structure]:
     """Structures over the search space, its corners among them."""
     unknowns, lower, upper = declared.unknowns, declared.lower, declared.upper
     ends = np.cumsum([unknown.size for unknown in unknowns])
@@ -443,10 +448,6 @@ def _structures(declared: Formulation) -> list[Structure]:
     if len(unknowns) <= 6:  # more bounds make too many corners
         for choice in product((False, True), repeat=len(unknowns)):
             points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
-    structures = []
     for x in points:
-        try:
-            structures.append(declared.matrices.structure(x, declared.own_test.test))
-        except InputError:  # no structure there
-            continue
-    return structures
+        with contextlib.suppress(InputError):  # no structure there
+            yield declared.matrices.structure(x, declared.own_test.test)
