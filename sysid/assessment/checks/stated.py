@@ -360,17 +360,19 @@ def wrong_statements(
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """The base force weighs what is stated but for a factor of two units."""
-    allowed = None if terms.mass is None or terms.below else _masses(declared)
-    if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
+    if terms.mass is None or terms.below or terms.modal_mass is None or terms.mass_std is None:
         return
-    low, high = (part[test.translational] for part in allowed)
     weighed, std, modal = (np.diag(it)[test.translational] for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    known = (weighed > most_deviations(CANDIDATES) * std) & np.isfinite(low) & (high > 0)
+    shown = weighed > most_deviations(CANDIDATES) * std
+    low = high = np.full(weighed.size, np.nan)
+    for mass in _masses(declared):
+        low, high = np.fmin(low, mass[test.translational]), np.fmax(high, mass[test.translational])
+        if np.any(shown & (weighed > low / MISFIT) & (weighed < high * MISFIT)):  # right units show at once
+            return
+    known = shown & np.isfinite(low) & (high > 0)
     if not np.any(known):
         return
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
-    if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
-        return
     for factor, label, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
         mended, of_modes = weighed / factor, modal / factor
@@ -386,17 +388,15 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
             return
 
 
-def _masses(declared: Formulation) -> tuple[Array, Array] | None:
-    """Least and largest mass that what is stated lets move in each base direction, (d,) each; None where it is open."""
+def _masses(declared: Formulation) -> Iterator[Array]:
+    """Masses that what is stated lets move in each base direction, (d,) each; none where they are open."""
     totals = declared.mass.totals
-    if totals is not None:
-        return totals.by_direction, totals.by_direction
     # A total that is not stated is searched about what the force weighs, of which nothing is known yet.
     weighed = declared.geometry.weighs and any(u.name == "total_mass" for u in declared.of_models[0])
-    if declared.mass.free or declared.stiffness.free or weighed:
-        return None
-    found = [np.diag(s.rigid_body_mass) for s in _structures(declared)]
-    return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
+    if totals is not None:
+        yield totals.by_direction
+    elif not (declared.mass.free or declared.stiffness.free or weighed):
+        yield from (np.diag(structure.rigid_body_mass) for structure in _structures(declared))
 
 
 def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement) -> Iterator[Finding]:
