@@ -59,7 +59,15 @@ BENCHMARKS = (
     Benchmark(
         "swarm.swarm_alone", "residual that the swarm reaches without a gradient step, and others", "25 min", "30 s"
     ),
-    Benchmark("swarm.hpso_ls", "fits by the paper's algorithm, without noise and with it", "1 h", "70 s", timed=True),
+    Benchmark(
+        "swarm.hpso_ls", "the tower by the paper's algorithm, without noise and with it", "30 min", "25 s", timed=True
+    ),
+    Benchmark(
+        "swarm.noisy_tests", "coupled structures by the paper's algorithm beside the modal strategy", "30 min", "20 s"
+    ),
+    Benchmark(
+        "swarm.refinement_by_ipopt", "eigenvalues refined by IPOPT: derivatives, leaders, statuses", "20 min", "10 s"
+    ),
     Benchmark(
         "swarm.structured", "springs, dampers, masses from wide bounds by swarm and simpler searches", "40 min", "30 s"
     ),

@@ -44,7 +44,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     all_ends: list[End] = []
     for case in CASES:
         seeds = SEEDS[: len(SEEDS) if case == CASES[0] else len(SEEDS) // 10]
-        seeds = seeds[: len(seeds) // 25] if reduced else seeds
+        seeds = seeds[: len(seeds) // 50] if reduced else seeds
         ends = spread(one, [(seed, case) for seed in seeds])
         found = Counter(end.verdict for end in ends)
         told = ", ".join(f"{verdict} {count}" for verdict, count in found.most_common())
