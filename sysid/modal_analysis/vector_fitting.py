@@ -230,10 +230,8 @@ def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, A
     by_velocity = records.fit(*first, velocity=True).squared_error
     if _is_exact(records, by_velocity) and not _is_exact(records, records.fit(*poles).squared_error):
         return _settled(records, *first, progress, velocity=True)  # records without noise, of other damping: no others
-    for _ in range(count):
-        more = _with_another(records, *poles, progress)
-        if more is None:
-            break
+    most = poles[0].size + count
+    while poles[0].size < most and (more := _with_another(records, *poles, progress)):
         poles = more
     poles = _merged(records, *poles, progress)
     criterion = _criterion(records, poles, velocity=False)

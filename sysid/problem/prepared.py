@@ -41,9 +41,8 @@ def points_of(formulation: Formulation) -> Array:
 
 def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
-    unit = box.latin_hypercube(count, formulation.size, rng)
     low, high = formulation.box
-    rows = low + unit * (high - low)
+    rows = low + box.latin_hypercube(count, formulation.size, rng) * (high - low)
     s = ca.MX.sym("s", formulation.size)
     unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
     return list(np.asarray(unknowns(rows.T)).T)  # a column each
