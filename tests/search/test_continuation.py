@@ -67,7 +67,8 @@ def test_a_range_of_nine_decades_is_no_scale():
 def test_the_same_seed_gives_the_same_bits():
     def once():
         _, _, K, C = springs_and_dampers()
-        return sysid.identify(sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C), rng=3)
+        problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+        return sysid.identify(problem, rng=3, strategy=sysid.Continuation(starts=2))
 
     first, second = once(), once()
     np.testing.assert_array_equal(first.x, second.x)
