@@ -1,7 +1,7 @@
 """Every notebook runs from a clean start, without an error or a warning, and draws pictures that show something.
 
 Jupyter executes the one on records where there are none, in a kernel of its own; all run cell by cell in this process,
-as a kernel does it, without the seconds that a new process spends on its imports.
+as a kernel does it, without the seconds that a new process spends on its imports, and look for no other answers.
 """
 
 import ast
@@ -62,7 +62,7 @@ def in_a_kernel(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def in_this_process(tmp_path, monkeypatch):
+def in_this_process(tmp_path, monkeypatch, no_other_answers):
     """Give a function that does the same in this process; a warning is an error here."""
     import jupytext
     import matplotlib as mpl
