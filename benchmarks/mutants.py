@@ -11,6 +11,7 @@ must occur exactly once. Its tests are found by the names of their files, wherev
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import os
 import re
@@ -339,11 +340,17 @@ def without_changes(results: Sequence[Result]) -> list[Result]:
 
 def occurrences(code: str, path: Path) -> list[re.Match[str]]:
     """Where code stands in a file, whatever the white space between its words and signs."""
-    text, parts = path.read_text(encoding="utf-8"), re.findall(r"\w+|[^\w\s]", code)
+    text, parts = _text(path), re.findall(r"\w+|[^\w\s]", code)
     if not all(part in text for part in parts):  # most files, and far quicker than the expression
         return []
     start, end = (r"\b" if re.match(r"\w", code[at]) else "" for at in (0, -1))
     return list(re.finditer(start + r"\s*".join(map(re.escape, parts)) + end, text))
+
+
+@functools.cache
+def _text(path: Path) -> str:
+    """Text of a file, of which each change asks."""
+    return path.read_text(encoding="utf-8")
 
 
 def _tests_of(name: str) -> list[str]:

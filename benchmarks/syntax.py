@@ -63,9 +63,9 @@ class Package:
         names = {module.name for module in self.modules}
         return tuple(
             (module, target, node)
-            for module in self.modules
+            for module, package in ((module, module.package) for module in self.modules)
             for node in module.nodes
-            for target in _targets(node, module.package, names)
+            for target in _targets(node, package, names)
         )
 
 

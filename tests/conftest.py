@@ -55,6 +55,14 @@ def no_other_answers(monkeypatch):
     monkeypatch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
 
 
+@pytest.fixture(scope="module")
+def no_other_answers_in_module():
+    """The same for all tests of a module, and for its fixtures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
+        yield
+
+
 def _geometry(rng, n, d):
     """Rows [e', (r x e)'] of n sensors at random places along random axes, the first d columns."""
     r, e = rng.uniform(-1, 2, (n, 3)), rng.normal(size=(n, 3))

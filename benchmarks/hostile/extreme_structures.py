@@ -41,15 +41,14 @@ class End(NamedTuple):
 
 def lines(reduced: bool) -> Iterator[Line]:
     """Verdicts of random structures, noise stated, half of them with lines on all resonances, case by case."""
-    all_ends: list[End] = []
+    shares = {case: (1 if case == CASES[0] else 10) * (50 if reduced else 1) for case in CASES}
+    tasks = [(seed, case) for case in CASES for seed in SEEDS[: len(SEEDS) // shares[case]]]
+    all_ends = spread(one, tasks)
     for case in CASES:
-        seeds = SEEDS[: len(SEEDS) if case == CASES[0] else len(SEEDS) // 10]
-        seeds = seeds[: len(seeds) // 25] if reduced else seeds
-        ends = spread(one, [(seed, case) for seed in seeds])
+        ends = [end for task, end in zip(tasks, all_ends, strict=True) if task[1] == case]
         found = Counter(end.verdict for end in ends)
         told = ", ".join(f"{verdict} {count}" for verdict, count in found.most_common())
-        yield below(f"{case}: {len(seeds)} structures: called determined and wrong ({told})", found["wrong"], 0)
-        all_ends += ends
+        yield below(f"{case}: {len(ends)} structures: called determined and wrong ({told})", found["wrong"], 0)
         if not reduced:
             yield _share(case, ends, SHARE)
         yield below(f"{case}: errors that are none of ours", found["foreign error"], 0)

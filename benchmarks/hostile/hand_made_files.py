@@ -61,7 +61,7 @@ _COMMAND = "from sysid.cli.main import command\n\nif __name__ == '__main__':\n  
 def lines(reduced: bool) -> Iterator[Line]:
     """Of each file: what ran or was imported, how it ended, what it took.
 
-    The reduced form leaves `report` and `export` to the files of one result in five.
+    The reduced form leaves `report` and `export` to the files of one result in ten.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
@@ -75,7 +75,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         known = _Known(here, sound)
         ran, wrong, most, count = [], [], 0.0, 0
         for at, file in enumerate(files):
-            commands = [one for one in file.commands if not (reduced and at % 5 and one[0] in ("report", "export"))]
+            commands = [one for one in file.commands if not (reduced and at % 10 and one[0] in ("report", "export"))]
             traces, faults, megabytes = known.tried(file, commands)
             count += len(commands)
             ran += [f"{file.what}: {trace}" for trace in traces]

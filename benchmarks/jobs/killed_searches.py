@@ -24,14 +24,15 @@ def lines(reduced: bool) -> Iterator[Line]:
     rng = np.random.default_rng(11)
     kills = 3 if reduced else KILLS
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(BESIDE) as pool:
-        whole = {case: _whole(case, Path(folder) / case) for case in searches.CASES}
+        ends = pool.map(lambda case: _whole(case, Path(folder) / case), searches.CASES)
+        whole = dict(zip(searches.CASES, ends, strict=True))
         tasks = [(Path(folder) / str(i), searches.CASES[i % len(searches.CASES)], rng.random()) for i in range(kills)]
-        ends = list(pool.map(lambda task: _killed(*task, *whole[task[1]]), tasks))
+        killed = list(pool.map(lambda task: _killed(*task, *whole[task[1]]), tasks))
     told = ", ".join(f"{case} {seconds:.1f} s" for case, (seconds, _) in whole.items())
     text = f"{kills} kills (-9) at random times ({told}): resumed, the same bits"
-    yield above(text, sum(same for _, same in ends), kills)
-    yield Line("of these: killed before there was a state, begun anew", f"{sum(end[0] == 'anew' for end in ends)}")
-    yield Line("of these: ended before the kill", f"{sum(end[0] == 'ended' for end in ends)}")
+    yield above(text, sum(same for _, same in killed), kills)
+    yield Line("of these: killed before there was a state, begun anew", f"{sum(end[0] == 'anew' for end in killed)}")
+    yield Line("of these: ended before the kill", f"{sum(end[0] == 'ended' for end in killed)}")
 
 
 def _whole(case: str, folder: Path) -> tuple[float, dict[str, bytes]]:

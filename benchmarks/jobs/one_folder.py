@@ -31,7 +31,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         _start(folder / "whole").communicate()
         seconds, answer = time.perf_counter() - begun, _answer(folder / "whole")
         for name, longest, pairs in (
-            (f"begun within {1e3 * TOGETHER:.0f} ms", TOGETHER, 2 if reduced else PAIRS),
+            (f"begun within {1e3 * TOGETHER:.0f} ms", TOGETHER, 1 if reduced else PAIRS),
             (f"begun within the {seconds:.1f} s of a run", seconds, 1 if reduced else PAIRS // 2),
         ):
             ends = [_pair(folder / f"{name} {i}", rng.uniform(0, longest), answer) for i in range(pairs)]

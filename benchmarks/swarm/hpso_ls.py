@@ -1,4 +1,4 @@
-"""The paper's hPSO-LS on the tower without noise, and on noisy tests, on seeds that served no choice of a constant."""
+"""The paper's hPSO-LS on the tower without noise, and with it, on seeds that served no choice of a constant."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm import controls, noisy_tests, refinement_by_ipopt
+from benchmarks.swarm import controls, noisy_tests
 from sysid.search.inverse_factor_coordinates import InverseFactorError
 
 SEEDS = range(9100, 9110)
@@ -36,8 +36,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         if not reduced:
             yield from controls.lines(what, sysid.Swarm.published(), results, seeds)
     yield below("exact Hessian against differences of the gradient, 5 random points, n = 6, relative", _hessian(), 1e-6)
-    yield from noisy_tests.lines(reduced)
-    yield from refinement_by_ipopt.lines(reduced)
+    yield from noisy_tests.tower_lines(reduced)
 
 
 def _sound(what: str, problem: sysid.Problem, fits: list[sysid.Identification]) -> Iterator[Line]:

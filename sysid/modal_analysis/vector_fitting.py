@@ -215,7 +215,7 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
         omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
         progress.step(error)
-        if error < round_off(len(records.data)) ** 2 * records.size or error > 0.97 * before:
+        if _is_exact(records, error) or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or more poles would replace it.
     return _prune(records, omega, ratios, progress, velocity=True)
@@ -227,10 +227,11 @@ def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, A
     poles = _settled(records, *first, progress)
     if poles[0].size == 0:
         return poles
-    for _ in range(count):
-        more = _with_another(records, *poles, progress)
-        if more is None:
-            break
+    by_velocity = records.fit(*first, velocity=True).squared_error
+    if _is_exact(records, by_velocity) and not _is_exact(records, records.fit(*poles).squared_error):
+        return _settled(records, *first, progress, velocity=True)  # records without noise, of other damping: no others
+    most = poles[0].size + count
+    while poles[0].size < most and (more := _with_another(records, *poles, progress)):
         poles = more
     poles = _merged(records, *poles, progress)
     criterion = _criterion(records, poles, velocity=False)
@@ -239,6 +240,11 @@ def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, A
         if with_velocity[0].size and _criterion(records, with_velocity, velocity=True) < criterion:
             return with_velocity
     return poles
+
+
+def _is_exact(records: Records, squared_error: float) -> bool:
+    """True where a fit leaves no more than round-off."""
+    return squared_error < round_off(len(records.data)) ** 2 * records.size
 
 
 def _criterion(records: Records, poles: tuple[Array, Array], *, velocity: bool) -> float:
@@ -361,7 +367,7 @@ def _polish(
     for _ in range(steps):
         error = fit.squared_error
         progress.step(error)
-        if error < round_off(len(records.data)) ** 2 * records.size:
+        if _is_exact(records, error):
             break
         step = np.clip(np.linalg.solve(H + damping * np.diag(np.diag(H)), slope), -0.5, 0.5)
         if np.linalg.norm(step - failed) < 1e-3 * np.linalg.norm(step):

@@ -42,12 +42,11 @@ def points_of(formulation: Formulation) -> Array:
 
 def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
-    unit = box.latin_hypercube(count, formulation.size, rng)
     low, high = formulation.box
-    rows = low + unit * (high - low)
+    rows = low + box.latin_hypercube(count, formulation.size, rng) * (high - low)
     s = ca.MX.sym("s", formulation.size)
     unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
-    return [np.asarray(unknowns(row)).ravel() for row in rows]
+    return list(np.asarray(unknowns(rows.T)).T)  # a column each
 
 
 def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:

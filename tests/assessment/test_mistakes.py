@@ -9,7 +9,8 @@ import sysid
 from benchmarks.mistakes.wrong_tests import CAUSES, SPECTRA, problem, right
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from sysid import FullMass, InputError, LumpedMass, Problem, SpectralStiffness, identify, simulate
-from sysid.assessment.checks.mistakes import mistakes_of
+from sysid.assessment.checks import stated
+from sysid.assessment.checks.mistakes import check_records, mistakes_of
 from sysid.modal_analysis.direct_terms import direct_terms
 
 BY_RECORDS = [name for name, cause in CAUSES.items() if SPECTRA in cause.kinds and not cause.untold]
@@ -133,6 +134,14 @@ def test_stated_frequencies_and_lines_in_rad_per_s(factor, words):
     stated = SpectralStiffness(factor * np.array([2.688, 6.682, 10.054, 12.838]))
     with pytest.raises(InputError, match=f"{words}.* in rad/s, not Hz: .*2 pi"):
         identify(Problem(test, mass=LumpedMass(1940.0), stiffness=stated), rng=0)
+
+
+@pytest.mark.parametrize(("form", "force"), [("chain", False), ("written", True)])
+def test_right_units_show_in_the_first_structures_that_a_model_allows(monkeypatch, form, force):
+    seen, structures = [], stated._structures
+    monkeypatch.setattr(stated, "_structures", lambda of: (seen.append(one) or one for one in structures(of)))
+    assert check_records(problem(form, right(SPECTRA, force=force).test).prepared) == ()
+    assert 1 <= len(seen) <= 6
 
 
 def test_sensors_that_are_swapped_in_a_written_model_are_told():

@@ -88,7 +88,7 @@ class TestStrategy:
 
 
 class TestSeeds:
-    @pytest.mark.parametrize("seed", [0, 7, 123456789])
+    @pytest.mark.parametrize("seed", [0, 123456789])
     def test_one_seed_gives_the_same_bits(self, problem, seed):
         first, again = (identify(problem, strategy=QUICK, rng=seed) for _ in range(2))
         same_bits(first, again)

@@ -1,7 +1,7 @@
 """Every notebook runs from a clean start, without an error or a warning, and draws pictures that show something.
 
-Jupyter executes the first, and the one on records where there are none, each in a kernel of its own; the others run
-cell by cell in this process, as a kernel does it, without the seconds that a new process spends on its imports.
+Jupyter executes the one on records where there are none, in a kernel of its own; all run cell by cell in this process,
+as a kernel does it, without the seconds that a new process spends on its imports, and look for no other answers.
 """
 
 import ast
@@ -62,7 +62,7 @@ def in_a_kernel(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def in_this_process(tmp_path, monkeypatch):
+def in_this_process(tmp_path, monkeypatch, no_other_answers):
     """Give a function that does the same in this process; a warning is an error here."""
     import jupytext
     import matplotlib as mpl
@@ -117,13 +117,7 @@ def _show_something(pngs):
         assert np.ptp(picture[..., :3]) > 0.5  # ink on paper
 
 
-def test_a_notebook_runs_in_a_clean_kernel_and_draws(in_a_kernel):
-    pngs, complaints = in_a_kernel(NOTEBOOKS[0])
-    assert not complaints
-    _show_something(pngs)
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS[1:], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_a_clean_start_and_draws(in_this_process, path):
     if path in REAL and not os.environ.get("SYSID_DATA"):
         pytest.skip("SYSID_DATA names no folder of records")
@@ -138,3 +132,4 @@ def test_a_notebook_on_records_that_are_not_there_says_so_and_ends(in_a_kernel, 
     pngs, complaints = in_a_kernel(path)
     assert not complaints
     assert len(pngs) == 1
+    _show_something(pngs)

@@ -65,9 +65,9 @@ def uninterrupted():
 
 @pytest.mark.parametrize(
     ("form", "strategy", "shares"),
-    [("chain", "continuation", [0.5, 1.0]), ("chain", SHORT, [0.5, 1.0]), ("free", SHORT, ENDS),
+    [("chain", SHORT, [0.5, 1.0]), ("free", SHORT, ENDS),
      ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders"), ENDS),
-     ("chain", "auto", [0.5]), ("free", "auto", ENDS)],  # of the chain "auto" is continuation too
+     ("chain", "auto", [0.5, 1.0]), ("free", "auto", ENDS)],  # of the chain "auto" is continuation
 )  # fmt: skip
 def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, shares, random_case, tmp_path):
     problem = chain() if form == "chain" else free_modes(random_case)
@@ -141,14 +141,14 @@ def test_what_ran_out_of_time_is_done_again_with_more(tmp_path):
     """Ctrl-C in the last phase of a search whose time was over before: its fits may have ended where no fit ends."""
 
     def interrupt(progress):
-        if progress.phase == "continuation" and progress.seconds < 1.0:
-            time.sleep(1.0)
+        if progress.phase == "continuation" and progress.seconds < limit:
+            time.sleep(limit - progress.seconds)
         if progress.phase == "local phase":
             raise KeyboardInterrupt
 
-    problem, file = chain(), tmp_path / "state.h5"
+    problem, file, limit = chain(), tmp_path / "state.h5", 3.0  # s: what comes before takes one on a busy machine
     strategy = sysid.Continuation(starts=1)
-    first = sysid.identify(problem, strategy=strategy, rng=0, max_time=1.0, callback=interrupt, checkpoint=file)
+    first = sysid.identify(problem, strategy=strategy, rng=0, max_time=limit, callback=interrupt, checkpoint=file)
     assert first.interrupted
     again = sysid.identify(problem, strategy=strategy, rng=0, checkpoint=file)
     assert bits(again) == bits(sysid.identify(problem, strategy=strategy, rng=0))

@@ -198,7 +198,7 @@ def test_a_damaged_state_is_told_and_fresh_leads_on(stopped, complaint):
 
 
 def test_while_a_process_runs_another_is_refused_and_once_it_is_killed_that_one_goes_on(
-    here, process, without_pictures, interruptible, complaint, files
+    here, without_pictures, no_pictures, interruptible, complaint, files
 ):
     """By -9, whatever it is doing."""
     (here / "pair.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
@@ -212,7 +212,6 @@ def test_while_a_process_runs_another_is_refused_and_once_it_is_killed_that_one_
         running.send_signal(signal.SIGKILL)
     assert running.wait() == -signal.SIGKILL
     assert (here / "out" / FILE_NAME).is_file()
-    done = process("run", "pair.py", "--resume", "out", cwd=here)
-    assert done.returncode == 1  # that goal is beyond round-off
+    assert cli.main(["run", "pair.py", "--resume", "out"]) == 1  # that goal is beyond round-off
     assert files(here / "out") == {"result.h5", "summary.json", "report.html"}
     assert sysid.load(here / "out").residual < 1e-9

@@ -18,10 +18,9 @@ from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, NumberOfModes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.modal_analysis.residues import linear_residues
 from sysid.modal_analysis.vector_fitting import find_poles
-from sysid.results.judgement import judge
 from sysid.search.continuation import descend
 from sysid.search.session import DeferredInterrupt, Session
-from sysid.search.strategy import History, Outcome, as_unknowns
+from sysid.search.strategy import as_unknowns
 
 MASS = np.diag([300.0, 200.0, 0.0])
 STRETCH = np.array([[1.0, 0, -1], [-1, 1, 0]])
@@ -398,11 +397,11 @@ def test_noise_moves_a_part_of_the_records_by_its_stated_deviations(ratio):
 
 
 def _from_truth(made):
-    """The fit by gradients from the truth, and its judgement."""
+    """The fit by gradients from the truth, not judged."""
     session = Session([], DeferredInterrupt())
     answer = descend(made.prepared, as_unknowns(made.prepared, np.concatenate([SPRINGS, DAMPERS])), [], session)
-    end = Outcome(made.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
-    return judge(made, made.prepared, end, "from the truth", 0, session)
+    assert answer.success
+    return sysid.Identification(made.structure(answer.x), made, answer.x, "local phase", 0, sysid.History(), ())
 
 
 def test_so_many_modes_are_those_that_the_records_need_most():

@@ -5,6 +5,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement, Problem, simulate
+from sysid.modal_analysis import vector_fitting
 from sysid.modal_analysis.complex_frequency import PolesAndResidues, noise_level
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, SubsetFits
@@ -130,6 +131,14 @@ def test_damping_that_is_not_classical_does_not_multiply_poles(dashpot, noise):
     assert found.omega.size == 3
     np.testing.assert_allclose(found.omega, np.abs(values), rtol=noise + 1e-10)
     np.testing.assert_allclose(found.ratios, -values.real / np.abs(values), rtol=5 * noise + 1e-9)
+
+
+def test_where_velocities_leave_round_off_no_further_pole_is_tried(monkeypatch):
+    truth = building(25.0)
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.5 * f[0], 1.3 * f[-1], 120))
+    monkeypatch.setattr(vector_fitting, "_with_another", lambda *of: pytest.fail("another pole is tried"))
+    assert find_poles(test).omega.size == 3
 
 
 @pytest.mark.parametrize(("n", "d"), [(4, 2), (6, 2), (6, 3)])

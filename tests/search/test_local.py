@@ -139,24 +139,22 @@ def test_a_local_minimum_of_the_residues_is_seen_and_left(from_random_start, mas
 
 @pytest.mark.parametrize(("mass", "damping", "force"), list(itertools.product(MASSES, DAMPINGS, (False, True))))
 def test_from_near_the_truth_every_search_of_a_spectral_stiffness_ends_there(random_case, mass, damping, force):
-    for seed in range(2):
-        rng = np.random.default_rng([seed, 4])
-        truth, problem = random_case(rng, mass, "spectral", damping, n=4, force=force)
-        answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05), max_iterations=300)
-        assert sound(problem, answer) < 1e-8
-        if force:
-            assert problem.measurement.force_residual(problem.structure(answer.x)) < 1e-8
+    rng = np.random.default_rng([0, 4])
+    truth, problem = random_case(rng, mass, "spectral", damping, n=4, force=force)
+    answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05), max_iterations=300)
+    assert sound(problem, answer) < 1e-8
+    if force:
+        assert problem.measurement.force_residual(problem.structure(answer.x)) < 1e-8
 
 
 @pytest.mark.parametrize(("mass", "damping"), list(itertools.product(MASSES, DAMPINGS)))
 def test_from_near_the_truth_every_search_of_a_chain_ends_there(random_case, mass, damping):
     """A full mass with a chain leaves directions open along which IPOPT still creeps when its iterations end."""
     goal = 1e-8 if mass in ("lumped", "known") else 1e-4
-    for seed in range(2):
-        rng = np.random.default_rng([seed, 4])
-        truth, problem = random_case(rng, mass, "chain", damping, n=4)
-        answer = local.solve(problem.prepared, near(rng, problem, truth, 0.01), max_iterations=200)
-        assert sound(problem, answer) < goal
+    rng = np.random.default_rng([0, 4])
+    truth, problem = random_case(rng, mass, "chain", damping, n=4)
+    answer = local.solve(problem.prepared, near(rng, problem, truth, 0.01), max_iterations=200)
+    assert sound(problem, answer) < goal
 
 
 @pytest.mark.parametrize("mass", ["rigid_body", "lumped", "known"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
@@ -359,22 +360,22 @@ def wrong_statements(
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """The base force weighs what is stated but for a factor of two units."""
-    allowed = None if terms.mass is None or terms.below else _masses(declared)
-    if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
+    if terms.mass is None or terms.below or terms.modal_mass is None or terms.mass_std is None:
         return
-    low, high = (part[test.translational] for part in allowed)
     weighed, std, modal = (np.diag(it)[test.translational] for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    known = (weighed > most_deviations(CANDIDATES) * std) & np.isfinite(low) & (high > 0)
-    if not np.any(known):
-        return
+    shown = weighed > most_deviations(CANDIDATES) * std
+    low = high = np.full(weighed.size, np.nan)
+    for mass in _masses(declared):
+        low, high = np.fmin(low, mass[test.translational]), np.fmax(high, mass[test.translational])
+        if np.any(shown & (weighed > low / MISFIT) & (weighed < high * MISFIT)):  # right units show at once
+            return
+    known = shown & np.isfinite(low) & (high > 0)
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
-    if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
-        return
     for factor, label, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
         mended, of_modes = weighed / factor, modal / factor
         agree = (mended > low / _WITHIN) & (mended < high * _WITHIN) & (of_modes > _MODAL * low)
-        if np.all(agree):
+        if np.any(known) and np.all(agree):
             masses = ", ".join(f"{m:.4g}" for m in weighed)
             stated = ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
             yield Finding(
@@ -385,17 +386,15 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
             return
 
 
-def _masses(declared: Formulation) -> tuple[Array, Array] | None:
-    """Least and largest mass that what is stated lets move in each base direction, (d,) each; None where it is open."""
+def _masses(declared: Formulation) -> Iterator[Array]:
+    """Masses that what is stated lets move in each base direction, (d,) each; none where they are open."""
     totals = declared.mass.totals
-    if totals is not None:
-        return totals.by_direction, totals.by_direction
     # A total that is not stated is searched about what the force weighs, of which nothing is known yet.
     weighed = declared.geometry.weighs and any(u.name == "total_mass" for u in declared.of_models[0])
-    if declared.mass.free or declared.stiffness.free or weighed:
-        return None
-    found = [np.diag(s.rigid_body_mass) for s in _structures(declared)]
-    return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
+    if totals is not None:
+        yield totals.by_direction
+    elif not (declared.mass.free or declared.stiffness.free or weighed):
+        yield from (np.diag(structure.rigid_body_mass) for structure in _structures(declared))
 
 
 def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement) -> Iterator[Finding]:
@@ -408,13 +407,17 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
     found = (problem.geometry.poles.omega if plain else poles_of_test(test)[0]) / (2 * np.pi)
     if stated is not None:
         low = high = np.atleast_1d(np.array(stated, dtype=float))
-        what = "the stated natural frequencies are"
+        what = f"the stated natural frequencies are {low[0]:.4g}"
     else:
-        frequencies = [s.natural_frequencies for s in _structures(declared)]
+        frequencies = []
+        for structure in _structures(declared):
+            frequencies.append(structure.natural_frequencies)
+            if found[0] <= MISFIT * frequencies[-1][0]:  # as right lines are at once: nothing more to look at
+                return
         if not frequencies:
             return
         low, high = np.min(frequencies, axis=0), np.max(frequencies, axis=0)
-        what = "the bounds of the model allow first natural frequencies"
+        what = f"the bounds of the model allow first natural frequencies of {low[0]:.4g} to {high[0]:.4g}"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
     modes, between = ", ".join(f"{f:.4g}" for f in found[:4]), "and a factor of 2 pi = 6.283 lies between"
     numbers = {"stated": float(low[0]), "found": float(found[0])}
@@ -426,27 +429,19 @@ def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement)
             "divide what is stated by 2 pi", numbers=numbers,
         )  # fmt: skip
     if found[0] > MISFIT * high[0] and inside(found / (2 * np.pi)):
-        span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
-            f"the lines are in rad/s, not Hz: the records have modes at {modes} Hz as they are given, {what} {span} "
-            f"Hz, {between}",
+            f"the lines are in rad/s, not Hz: the records have modes at {modes} Hz as they are given, {what} Hz, "
+            f"{between}",
             "divide the frequencies by 2 pi", numbers=numbers,
         )  # fmt: skip
 
 
-def _structures(declared: Formulation) -> list[Structure]:
+def _structures(declared: Formulation) -> Iterator[Structure]:
     """Structures over the search space, its corners among them."""
-    unknowns, lower, upper = declared.unknowns, declared.lower, declared.upper
-    ends = np.cumsum([unknown.size for unknown in unknowns])
-    points = list(points_of(declared))
-    if len(unknowns) <= 6:  # more bounds make too many corners
-        for choice in product((False, True), repeat=len(unknowns)):
-            points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
-    structures = []
-    for x in points:
-        try:
-            structures.append(declared.matrices.structure(x, declared.own_test.test))
-        except InputError:  # no structure there
-            continue
-    return structures
+    sizes = [unknown.size for unknown in declared.unknowns]
+    choices = product((False, True), repeat=len(sizes)) if len(sizes) <= 6 else ()  # more bounds make too many corners
+    corners = (np.where(np.repeat(choice, sizes), declared.upper, declared.lower) for choice in choices)
+    for x in chain(points_of(declared), corners):
+        with contextlib.suppress(InputError):  # no structure there
+            yield declared.matrices.structure(x, declared.own_test.test)
