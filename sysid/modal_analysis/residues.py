@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import separable
 from sysid.modal_analysis.pole_functions import Basis, Beside, OfRun, PoleFunctions, orthonormal, unit_columns
-from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
+from sysid.modal_analysis.response import columns, gains, gains_and_slopes, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
@@ -193,6 +193,12 @@ class Records:
             np.concatenate([part.reshape(rows, m, -1) for part in shared], axis=2).reshape(rows, -1), inputs, by_run
         )
 
+    def pole_slopes(self, omega: Array, ratios: Array, *, velocity: bool) -> PoleFunctions:
+        """Derivatives of the columns of `functions` by log w_k, then by log zeta_k, as those of 2m poles."""
+        g, by_pole = gains_and_slopes(self.freq, omega, ratios)
+        turned = 2j * np.pi * self.freq / np.tile(omega, 2)[:, None] * (by_pole - np.concatenate([g, np.zeros_like(g)]))
+        return self.of_poles([by_pole, turned][: 1 + velocity])
+
     @property
     def _shared(self) -> int:
         """Inputs that are not of one run among several."""
@@ -262,6 +268,17 @@ class Records:
             plain = (residues / self.channel).reshape(len(residues), self.n_base, self.n_sensors)
             return plain.transpose(0, 2, 1)
         return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
+
+
+def pole_equations(beside: Beside, products: Array, residues: Array) -> tuple[Array, Array]:
+    """Gauss-Newton matrix (2m, 2m) of poles with free residues (m, inputs, channels), and the direction of descent.
+
+    `beside` is what a fit leaves of `Records.pole_slopes`, and `products` that with what it leaves of the data.
+    """
+    each = np.concatenate([residues, residues]).reshape(products.shape)
+    by_pole = (2 * len(residues), residues.shape[1])
+    normal = (beside.gram() * (each @ each.T)).reshape(by_pole * 2).sum(axis=(1, 3))
+    return normal, np.sum(products * each, axis=1).reshape(by_pole).sum(axis=1)
 
 
 class SubsetFits:
