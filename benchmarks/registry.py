@@ -181,6 +181,7 @@ BENCHMARKS = (
         "15 s",
         timed=True,
     ),
+    Benchmark("estimate.answers", "modes, judgement and matrices beside an older commit's", "8 min", "20 s"),
     Benchmark(
         "band.continuous",
         "beams, frames, plates with modes beyond the lines: determined, exact",
