@@ -98,15 +98,14 @@ def last_phase(name: str) -> Phase | str:
     """The run of IPOPT that an answer comes from, or what is not as it should be."""
     with watched() as phases:
         result = sysid.identify(_problem(name), rng=0)
-    if not phases:
-        return "no run of IPOPT"
-    last = phases[-1]
-    if last.status not in result.message:
-        return f"IPOPT ended with {last.status}, and the result says: {result.message}"
     # Of whole records IPOPT's objective is what modes miss their estimate by.
-    if not result.fitted.by_modes and abs(last.value - result.objective) > OBJECTIVE * result.objective + EXACT:
-        return f"IPOPT ended at an objective of {last.value:.6g}, and the answer has {result.objective:.6g}"
-    return last
+    near = OBJECTIVE * result.objective + EXACT
+    of_answer = [one for one in phases if result.fitted.by_modes or abs(one.value - result.objective) < near]
+    read = [one for one in of_answer if one.status in result.message]
+    if read:
+        return read[-1]
+    ends = ", ".join(f"{one.status} at {one.value:.6g}" for one in phases)
+    return f"IPOPT ended with {ends or 'nothing'}, the answer is at {result.objective:.6g}: {result.message}"
 
 
 def _succeeds_with_wrong_sign(name: str, strategy: str) -> bool:
