@@ -43,8 +43,8 @@ def lines(reduced: bool) -> Iterator[Line]:
             found = {seed: differences(*[worker((what, seed)) for worker in both]) for seed in cases}
             other = {seed: said for seed, said in found.items() if said}
             unexplained = [f"{seed}: {said}" for seed, said in other.items() if (what, seed) not in EXPLAINED]
-            shown = f" ({'; '.join(unexplained)})" if unexplained else ""
-            yield below(f"{len(cases)} {what}: answers other than {COMMIT}'s, unexplained{shown}", len(unexplained), 0)
+            listed = f" ({'; '.join(unexplained)})" if unexplained else ""
+            yield below(f"{len(cases)} {what}: answers other than {COMMIT}'s, unexplained{listed}", len(unexplained), 0)
             for seed in other:
                 if (what, seed) in EXPLAINED:
                     yield Line(f"{what} {seed}: {other[seed]}: {EXPLAINED[what, seed]}", "explained")

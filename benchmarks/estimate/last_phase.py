@@ -83,14 +83,14 @@ def lines(reduced: bool) -> Iterator[Line]:
     names += [f"{what} {seed}" for what, count in COUNTS.items() for seed in range(0, count, SHORT if reduced else 1)]
     ends = {name: last_phase(name) for name in names}
     other = [f"{name}: {end}" for name, end in ends.items() if isinstance(end, str)]
-    shown = f" ({'; '.join(other)})" if other else ""
-    yield below(f"{len(ends)} identifications that do not end in IPOPT with its status read{shown}", len(other), 0)
+    listed = f" ({'; '.join(other)})" if other else ""
+    yield below(f"{len(ends)} identifications that do not end in IPOPT with its status read{listed}", len(other), 0)
     ratios = {name: end.ratio for name, end in ends.items() if isinstance(end, Phase)}
     worst = max(ratios, key=lambda name: ratios[name])
     yield below(f"gradient at their ends over that at 1 % off, the largest, {worst}", ratios[worst], SLOPE)
     unseen = [f"{name}, {strategy}" for name, strategy in WRONG if _succeeds_with_wrong_sign(name, strategy)]
-    shown = f" ({'; '.join(unseen)})" if unseen else ""
-    text = f"{len(WRONG)} identifications with one sign changed in the symbolic residual: that report success{shown}"
+    listed = f" ({'; '.join(unseen)})" if unseen else ""
+    text = f"{len(WRONG)} identifications with one sign changed in the symbolic residual: that report success{listed}"
     yield below(text, len(unseen), 0)
 
 
@@ -123,8 +123,8 @@ def _problem(name: str) -> sysid.Problem:
     what, _, seed = name.partition(" ")
     if seed:
         return sysid.Problem(test_of(what, int(seed)), mass=sysid.FullMass())
-    made: sysid.Problem = load_module(name).problem()
-    return made
+    problem: sysid.Problem = load_module(name).problem()
+    return problem
 
 
 @contextlib.contextmanager

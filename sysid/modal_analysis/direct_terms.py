@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import Records, pole_equations
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
@@ -106,9 +106,9 @@ def _of_accelerations(still: Measurement) -> tuple[_AtPoles, _Fit] | None:
 
 
 def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
-    """The fit after Levenberg-Marquardt steps of its poles, until one would move no term by its deviation.
+    """The fit after Levenberg-Marquardt steps to likelier poles, until one would move no term by its deviation.
 
-    The likelihood decides in which each channel has its own level of noise; `least` is the least damping.
+    Each channel has its own level of noise; `least` is the least damping.
     """
     damping, longest = 10 * least, 0.3
     limits = np.log(_limits(best.records)).repeat(best.omega.size, axis=1)
@@ -190,10 +190,10 @@ class _AtPoles:
         slopes = self.records.pole_slopes(self.omega, self.ratios, velocity=True)
         beside = self.basis.beside(slopes)
         products = beside.products(beside.shared.T @ self.left, self.left)
-        normal, descent = pole_equations(beside, products / self.level, self.residues / self.level)
-        shown = self.basis.shared @ self.rows[:, -self.basis.shared.shape[1] :].T  # whose products with data are terms
-        of_runs = [columns.T @ shown[rows] for rows, _, columns in slopes.by_run]
-        of_slopes = slopes.in_order([*of_runs, slopes.shared.T @ shown]).reshape(2, *self.residues.shape[:2], -1)
+        normal, descent = beside.pole_equations(products / self.level, self.residues / self.level)
+        weights = self.basis.shared @ self.rows[:, -self.basis.shared.shape[1] :].T  # whose sums of data are the terms
+        of_runs = [columns.T @ weights[rows] for rows, _, columns in slopes.by_run]
+        of_slopes = slopes.in_order([*of_runs, slopes.shared.T @ weights]).reshape(2, *self.residues.shape[:2], -1)
         by_pole = -np.einsum("amit,mic->amtc", of_slopes, self.residues)
         return normal, descent, by_pole.reshape(self.poles.size, *self.terms.shape)
 

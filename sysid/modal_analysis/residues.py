@@ -270,17 +270,6 @@ class Records:
         return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
 
 
-def pole_equations(beside: Beside, products: Array, residues: Array) -> tuple[Array, Array]:
-    """Gauss-Newton matrix (2m, 2m) of poles with free residues (m, inputs, channels), and the direction of descent.
-
-    `beside` is what a fit leaves of `Records.pole_slopes`, and `products` that with what it leaves of the data.
-    """
-    each = np.concatenate([residues, residues]).reshape(products.shape)
-    by_pole = (2 * len(residues), residues.shape[1])
-    normal = (beside.gram() * (each @ each.T)).reshape(by_pole * 2).sum(axis=(1, 3))
-    return normal, np.sum(products * each, axis=1).reshape(by_pole).sum(axis=1)
-
-
 class SubsetFits:
     """Fits of the records on subsets of given poles, all from one QR factorisation of the functions of these poles.
 

@@ -17,7 +17,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, pole_equations
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance, round_off
@@ -385,4 +385,5 @@ def _polish(
 def _projected(records: Records, p: Array, fit: ResidueFit, velocity: bool) -> tuple[Array, Array]:
     """Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at the `fit` on log poles `p`."""
     slopes = records.pole_slopes(*np.exp(p.reshape(2, -1)), velocity=velocity)
-    return pole_equations(*fit.beside(slopes), fit.residues)
+    beside, products = fit.beside(slopes)
+    return beside.pole_equations(products, fit.residues)
