@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -108,15 +109,17 @@ def _of_accelerations(still: Measurement) -> tuple[_AtPoles, _Fit] | None:
 def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
     """The fit after Levenberg-Marquardt steps to likelier poles, until one would move no term by its deviation.
 
-    Each channel has its own level of noise; `least` is the least damping.
+    Each channel has its own level of noise. No pole leaves the lines downwards, where modes show by their tail.
     """
     damping, longest = 10 * least, 0.3
-    limits = np.log(_limits(best.records)).repeat(best.omega.size, axis=1)
+    lowest = np.log(2 * np.pi * best.records.freq[best.records.freq > 0][0])
     for _ in range(steps):
         step, moved = best.step(damping)
         if np.max(np.abs(moved)) < 1:
             break
-        trial = _AtPoles(best.records, np.clip(best.poles + np.clip(step, -longest, longest), *limits))
+        omega, ratios = (best.poles + np.clip(step, -longest, longest)).reshape(2, -1)
+        poles = np.concatenate([np.maximum(omega, lowest), np.minimum(ratios, np.log(_MODE))])
+        trial = _AtPoles(best.records, poles)
         better = np.sum(np.log(trial.level)) < np.sum(np.log(best.level))
         best, damping = (trial, max(damping / 10, least)) if better else (best, 10 * damping)
     return best
@@ -138,16 +141,9 @@ def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
     direct = _without_poles(records.freq)
     for step in range(steps):
         omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
-    low, high = _limits(records)
-    kept = (omega > low[0]) & (omega < high[0]) & (ratios < high[1])
+    kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return (omega[kept], ratios[kept]) if np.any(kept) else None
-
-
-def _limits(records: Records) -> Array:
-    """Least and largest circular frequency, rad/s, and damping ratio of poles, (2, 2)."""
-    lines = 2 * np.pi * records.freq[records.freq > 0]
-    return np.array([[lines[0], ROUND_OFF], [_OUTSIDE * lines[-1], _MODE]])
 
 
 def _without_poles(freq: Array) -> ComplexArray:
@@ -170,7 +166,9 @@ class _AtPoles:
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
         answered = self.basis.answers(records.data)
         self.left = records.data - self.basis.times(answered)
-        inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]
+        regular = scipy.linalg.lapack.dtrcon(R)[0] > ROUND_OFF
+        inverse = scipy.linalg.lapack.dtrtri(R)[0] if regular else np.linalg.pinv(R, rcond=ROUND_OFF)
+        inverse /= size[:, None]
         beta, self.count = inverse @ answered, len(R)
         of_poles = self.count - functions.shared.shape[1]  # behind those of one run each, and those without poles
         of_runs = of_poles - direct.shape[1]
