@@ -1,12 +1,16 @@
-"""An older commit of this repository beside the package as it is: a process of each, timed in turn."""
+"""An older commit of this repository beside the package as it is: a process of each, asked in turn."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from benchmarks.problem_modules import ROOT
 
@@ -14,7 +18,7 @@ COMMIT = "47a2c0f"
 
 
 class Worker:
-    """A process that runs a script with the package in a folder, on one thread: a case in, a number out."""
+    """A process that runs a script with the package in a folder, on one thread: a case in, an answer out."""
 
     def __init__(self, folder: Path, script: Path) -> None:
         environment = {**os.environ, "PYTHONPATH": str(folder), "OPENBLAS_NUM_THREADS": "1"}
@@ -23,7 +27,7 @@ class Worker:
             cwd=folder,
         )  # fmt: skip
 
-    def __call__(self, case: object) -> float:
+    def __call__(self, case: object) -> Any:
         """Answer of the process to a case.
 
         Raises
@@ -37,7 +41,7 @@ class Worker:
         said = self.process.stdout.readline()
         if not said:
             raise EOFError(f"{self.process.args} ended at {case}")
-        return float(said)
+        return json.loads(said)
 
     def close(self) -> None:
         """End the process."""
@@ -46,7 +50,26 @@ class Worker:
         self.process.wait()
 
 
-def unpacked(folder: Path) -> bool:
+@contextlib.contextmanager
+def workers(script: Path) -> Iterator[list[Worker]]:
+    """Processes of a script of a group, with the package as it is and with that commit's; none without its history."""
+    with contextlib.ExitStack() as stack:
+        older = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        if not _unpacked(older):
+            yield []
+            return
+        for part in {".", "records", "modal", script.parent.name}:  # what poses a case is the same for both
+            for name in (ROOT / "benchmarks" / part).glob("*.py"):
+                target = older / "benchmarks" / part / name.name
+                target.parent.mkdir(exist_ok=True)
+                target.write_bytes(name.read_bytes())
+        both = [Worker(folder, folder / script.relative_to(ROOT)) for folder in (ROOT, older)]
+        for worker in both:
+            stack.callback(worker.close)
+        yield both
+
+
+def _unpacked(folder: Path) -> bool:
     """True where the commit could be written to a folder."""
     archive = folder / "archive.tar"
     command = ["git", "archive", "--output", str(archive), COMMIT]

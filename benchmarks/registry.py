@@ -189,6 +189,8 @@ BENCHMARKS = (
         "15 s",
         timed=True,
     ),
+    Benchmark("estimate.answers", "modes, judgement and matrices beside an older commit's", "8 min", "20 s"),
+    Benchmark("estimate.last_phase", "ends in IPOPT, their gradients, wrong signs noticed", "3 min", "15 s"),
     Benchmark(
         "band.continuous",
         "beams, frames, plates with modes beyond the lines: determined, exact",

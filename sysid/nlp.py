@@ -29,6 +29,7 @@ _ENDED = {
 }
 _LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
 GRACE = 0.4  # s, by which work may end late: what each of the last steps has, however late it begins
+_TOO_SMALL = "Search_Direction_Becomes_Too_Small"  # IPOPT's word, where no step shows in the objective
 _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
 
 
@@ -228,6 +229,7 @@ class NonlinearProgram:
         call = monitor.callback(start, below.size)
 
         def run(at: Array, tolerance: float) -> tuple[str, Array]:
+            monitor.begun = monitor.taken
             limits = {"max_wall_time": max(monitor.left, 0.1)} if np.isfinite(monitor.left) else {}
             quiet = quiet_options(
                 max_iterations, tol=tolerance, acceptable_tol=acceptable * tolerance, acceptable_iter=5,
@@ -237,11 +239,13 @@ class NonlinearProgram:
             solver = ca.nlpsol("local", "ipopt", nlp, options)
             answer = solver(x0=at, lbx=lower, ubx=upper, lbg=below, ubg=above)
             status = solver.stats()["return_status"]
-            return _LATE if status == "User_Requested_Stop" else status, np.asarray(answer["x"]).ravel()
+            if status == "User_Requested_Stop":
+                status = _LATE if monitor.is_over or not monitor.stands_still else _TOO_SMALL
+            return status, np.asarray(answer["x"]).ravel()
 
         try:
             status, best = run(start, _TOLERANCE)
-            if status == "Search_Direction_Becomes_Too_Small" and monitor.stopped is None:
+            if status == _TOO_SMALL and monitor.stopped is None:
                 # Noise can leave the gradient's round-off above the tolerance: the same point is judged by a wider one.
                 status, best = run(best, 1e3 * _TOLERANCE)
         except KeyboardInterrupt as interrupt:
@@ -298,6 +302,7 @@ class IterationMonitor:
         self.listener = listener
         self.deadline = np.inf if max_time is None else time.perf_counter() + max_time
         self.curve: list[float] = []
+        self.begun = 0  # iterates before the run
         self.stopped: BaseException | None = None
         self.z: Array = np.zeros(0)
 
@@ -314,6 +319,12 @@ class IterationMonitor:
     def allows(self, seconds: float) -> bool:
         """True where work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
         return suffices(self.left, seconds)
+
+    @property
+    def stands_still(self) -> bool:
+        """True where no iterate of the last 20 of a run changed the objective but for its round-off."""
+        last = self.curve[max(self.begun, self.taken - 20) :]
+        return len(last) == 20 and max(last) - min(last) < 1e-12 * last[-1]
 
     @property
     def taken(self) -> int:
@@ -334,7 +345,7 @@ class IterationMonitor:
                 self.listener(len(self.curve) - 1, self.curve[-1])
         except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
             self.stopped = error
-        return self.stopped is not None or self.is_over
+        return self.stopped is not None or self.is_over or self.stands_still
 
 
 class _IterationCallback(ca.Callback):

@@ -27,8 +27,10 @@ CEILINGS = {
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530);
     # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340),
     # and fits that end when they are asked to, with the best so far, which results hold (400),
-    # and transients of runs eliminated run by run, noise levels and further modes of low rank (210).
-    "lines": 40_350,
+    # and transients of runs eliminated run by run, noise levels and further modes of low rank (210),
+    # and signs, gains and delays on settled poles, whose errors count (105),
+    # and modes beyond the lines, which answer in the band and are none of the structure's (450).
+    "lines": 40_438,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.line import Line, below
-from benchmarks.older import COMMIT, Worker, unpacked
-from benchmarks.problem_modules import ROOT
+from benchmarks.older import COMMIT, Worker, workers
 
-WORKER = Path(__file__).with_name("one_estimate.py")
 Case = tuple[str, int, int, int, int]  # what, modes, base directions, lines, seed
 # Bounds are of the ratio of processor times: seconds asked for over those of the older commit on one machine.
 SPECTRA: dict[Case, tuple[float, float]] = {
@@ -33,32 +29,23 @@ TIMES = 3  # in turn
 def lines(reduced: bool) -> Iterator[Line]:
     """Medians of both and their ratio; the reduced form takes the two smallest tests."""
     cases = {**SPECTRA, **RECORDS}
-    with contextlib.ExitStack() as stack:
-        older = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        if not unpacked(older):
+    with workers(Path(__file__).with_name("one_estimate.py")) as both:
+        if not both:
             yield Line(f"processor time over that of {COMMIT}", f"no git history with {COMMIT} here")
             return
-        for part in (".", "estimate", "records", "modal"):  # what poses a case is the same for both
-            for name in (ROOT / "benchmarks" / part).glob("*.py"):
-                target = older / "benchmarks" / part / name.name
-                target.parent.mkdir(exist_ok=True)
-                target.write_bytes(name.read_bytes())
-        workers = [Worker(folder, folder / WORKER.relative_to(ROOT)) for folder in (ROOT, older)]
-        for worker in workers:
-            stack.callback(worker.close)
-        for worker in workers:
+        for worker in both:
             worker(next(iter(cases)))  # what is imported at the first call is not counted
         for case, (asked, before) in list(cases.items())[: SHORT if reduced else None]:
-            yield _line(case, workers, asked, before)
+            yield _line(case, both, asked, before)
 
 
-def _line(case: Case, workers: list[Worker], asked: float, before: float) -> Line:
+def _line(case: Case, both: list[Worker], asked: float, before: float) -> Line:
     """The ratio of the medians of one case."""
     what, n, d, count, _ = case
     taken = []
     for _ in range(1 if what == "records" else TIMES):
         try:
-            taken.append([worker(case) for worker in workers])
+            taken.append([worker(case) for worker in both])
         except EOFError as error:
             return Line(f"{what}, n = {n}, d = {d}, {count} lines", str(error), f"<= {asked / before:.3g}", False)
     new, old = np.median(taken, axis=0)

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.line import Line, below
-from benchmarks.older import COMMIT, Worker, unpacked
-from benchmarks.problem_modules import ROOT
+from benchmarks.older import COMMIT, workers
 
 CASES = tuple((n, count) for n in (6, 10, 20) for count in (200, 1000))  # degrees of freedom, lines
 TIMES = 15  # both are timed, in turn
 BOUND = 1.1
-WORKER = Path(__file__).with_name("one_worker.py")
 
 
 def lines() -> Iterator[Line]:
     """Medians of both, alternated, and their ratio."""
     what = f"with force, one thread: microseconds a candidate over those of {COMMIT}"
-    with contextlib.ExitStack() as stack:
-        older = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        if not unpacked(older):
+    with workers(Path(__file__).with_name("one_worker.py")) as both:
+        if not both:
             yield Line(what, f"no git history with {COMMIT} here")
             return
-        workers = [Worker(folder, WORKER) for folder in (ROOT, older)]
-        for worker in workers:
-            stack.callback(worker.close)
         for case in CASES:
-            made = [worker(case) for worker in workers]
-            took = np.array([[worker(case) for worker in workers] for _ in range(TIMES)])
+            made = [worker(case) for worker in both]
+            took = np.array([[worker(case) for worker in both] for _ in range(TIMES)])
             new, old = np.median(took, axis=0)
             text = f"n = {case[0]}, d = 3, {case[1]} lines, {what} ({new:.1f} over {old:.1f}, {TIMES} times in turn)"
             yield below(text, float(new / old), BOUND)

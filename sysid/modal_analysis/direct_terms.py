@@ -8,11 +8,14 @@ tells what each sensor's row of G would have to be, whatever was stated of it. A
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
@@ -76,28 +79,50 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     with one_thread():
         every = found = _of_accelerations(still)
         for _ in range(3):  # times that lines with spikes are left out
-            if found is None or not found[2].spikes.any():
+            if found is None or not found[1].spikes.any():
                 break
-            still = still.at(~found[2].spikes)
+            still = still.at(~found[1].spikes)
             found = _of_accelerations(still)
         if every is None or found is None:
             return None
-        omega, ratios, rigid = found
-        force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
+        at, rigid = found
+        force = None if test.force is None else _fitted(_AtPoles(Records(still, force=True), at.poles), at.errors)
     (const, slope), (const_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every[2].misfit
+        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every[1].misfit
     )
 
 
-def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
-    """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found."""
+def _of_accelerations(still: Measurement) -> tuple[_AtPoles, _Fit] | None:
+    """Fit on poles as they are likeliest; None where the base moves in too few directions, or no pole is found."""
     records = Records(still)
     if not records.unit and records.driven < still.n_base:
         return None
     poles = _poles(records)
-    return None if poles is None else (*poles, _fitted(records, *poles))
+    if poles is None:
+        return None
+    at = _settled(_AtPoles(records, np.log(poles).ravel()))
+    return at, _fitted(at, at.errors)
+
+
+def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
+    """The fit after Levenberg-Marquardt steps to likelier poles, until one would move no term by its deviation.
+
+    Each channel has its own level of noise. No pole leaves the lines downwards, where modes show by their tail.
+    """
+    damping, longest = 10 * least, 0.3
+    lowest = np.log(2 * np.pi * best.records.freq[best.records.freq > 0][0])
+    for _ in range(steps):
+        step, moved = best.step(damping)
+        if np.max(np.abs(moved)) < 1:
+            break
+        omega, ratios = (best.poles + np.clip(step, -longest, longest)).reshape(2, -1)
+        poles = np.concatenate([np.maximum(omega, lowest), np.minimum(ratios, np.log(_MODE))])
+        trial = _AtPoles(best.records, poles)
+        better = np.sum(np.log(trial.level)) < np.sum(np.log(best.level))
+        best, damping = (trial, max(damping / 10, least)) if better else (best, 10 * damping)
+    return best
 
 
 def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
@@ -127,6 +152,74 @@ def _without_poles(freq: Array) -> ComplexArray:
     return np.stack([np.ones_like(x) + 0j, 1j * x, x**2 + 0j])
 
 
+class _AtPoles:
+    """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on those without poles.
+
+    Of the latter `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
+    """
+
+    def __init__(self, records: Records, poles: Array) -> None:
+        self.records, self.poles = records, poles
+        self.omega, self.ratios = np.exp(poles.reshape(2, -1))
+        direct = records.basis(_without_poles(records.freq), records.driven)
+        functions = records.functions(self.omega, self.ratios, velocity=True)
+        self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
+        answered = self.basis.answers(records.data)
+        self.left = records.data - self.basis.times(answered)
+        regular = scipy.linalg.lapack.dtrcon(R)[0] > ROUND_OFF
+        inverse = scipy.linalg.lapack.dtrtri(R)[0] if regular else np.linalg.pinv(R, rcond=ROUND_OFF)
+        inverse /= size[:, None]
+        beta, self.count = inverse @ answered, len(R)
+        of_poles = self.count - functions.shared.shape[1]  # behind those of one run each, and those without poles
+        of_runs = of_poles - direct.shape[1]
+        at = slice(of_runs, of_runs + 2 * records.driven)
+        self.terms, self.rows = beta[at], inverse[at]
+        residues = functions.in_order([beta[:of_runs], beta[of_poles:]])
+        self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
+        least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
+        self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+
+    @cached_property
+    def by_poles(self) -> tuple[Array, Array, Array]:
+        """Normal matrix of the poles, descent, each channel in units of its level, and slopes of the terms.
+
+        (2m, 2m), (2m,) and (2m, 2 driven inputs, channels); the residues follow the poles.
+        """
+        slopes = self.records.pole_slopes(self.omega, self.ratios, velocity=True)
+        beside = self.basis.beside(slopes)
+        products = beside.products(beside.shared.T @ self.left, self.left)
+        normal, descent = beside.pole_equations(products / self.level, self.residues / self.level)
+        weights = self.basis.shared @ self.rows[:, -self.basis.shared.shape[1] :].T  # whose sums of data are the terms
+        of_runs = [columns.T @ weights[rows] for rows, _, columns in slopes.by_run]
+        of_slopes = slopes.in_order([*of_runs, slopes.shared.T @ weights]).reshape(2, *self.residues.shape[:2], -1)
+        by_pole = -np.einsum("amit,mic->amtc", of_slopes, self.residues)
+        return normal, descent, by_pole.reshape(self.poles.size, *self.terms.shape)
+
+    @cached_property
+    def share(self) -> float:
+        """Root of the variance of the noise over the squares of levels, of which each channel has its own."""
+        unknowns, left = self.count * self.left.shape[1], self.left
+        factor = self.records.noise(left, unknowns) / self.records.variance(float(np.sum(left**2)), unknowns)
+        return float(np.sqrt(factor / max(len(left) - self.count, 1)))
+
+    @property
+    def errors(self) -> Array:
+        """Independent errors of the poles, (2m, r): those of noise, and last the step that they have still to go."""
+        normal, descent, _ = self.by_poles
+        unit = units_of(normal)
+        values, vectors = np.linalg.eigh(normal * np.outer(unit, unit))
+        known = values > ROUND_OFF * values[-1]
+        root = unit[:, None] * vectors[:, known] / np.sqrt(values[known])
+        return np.column_stack([self.share * root, root @ (descent @ root)])
+
+    def step(self, damping: float) -> tuple[Array, Array]:
+        """A damped step of the poles, and how far it moves the terms, in units of their deviations at fixed poles."""
+        normal, descent, by_pole = self.by_poles
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), descent)
+        std = np.linalg.norm(self.rows, axis=1)[:, None] * self.level / np.sqrt(max(len(self.left) - self.count, 1))
+        return step, np.tensordot(step, by_pole, 1) / std
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """Coefficients of the functions 1 and i w (2, channels, d), their deviations, and the sum of residues.
@@ -142,35 +235,24 @@ class _Fit:
     spikes: NDArray[np.bool_]
 
 
-def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
-    """Linear least squares on given poles; the slopes per rad/s."""
-    direct = records.basis(_without_poles(records.freq), records.driven)
-    functions = records.functions(omega, ratios, velocity=True)
-    basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
-    answered = basis.answers(records.data)
-    left = records.data - basis.times(answered)
-    inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]
-    beta, count = inverse @ answered, len(R)
-    first = count - functions.shared.shape[1]  # of the poles, behind the terms without them and those of one run each
-    terms = slice(first - direct.shape[1], first)
-    freedom = max(len(left) - count, 1)
-    level = np.maximum(np.linalg.norm(left, axis=0), ROUND_OFF * np.linalg.norm(records.data, axis=0))
+def _fitted(at: _AtPoles, errors: Array) -> _Fit:
+    """The fit in the test's own units, the slopes per rad/s; `errors` (2m, r) of the poles are independent ones."""
+    records, left = at.records, at.left
     tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
-    beyond = np.linalg.qr(tail - basis.times(basis.answers(tail)))[0]
-    noise = records.noise(left, count * left.shape[1])
+    beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
     gained = float(np.sum((beyond.T @ left) ** 2))
-    shared = noise / records.variance(float(np.sum(left**2)), count * left.shape[1])
+    noise = records.noise(left, at.count * left.shape[1])
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
-    of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
-    of_modes = beta[first:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
+    of_terms = lambda x: x.reshape(2, records.driven, *x.shape[1:])  # noqa: E731
+    of_poles = np.tensordot(at.by_poles[2], errors, (0, 0))
     return _Fit(
-        turn * _by_sensor(records, of_terms(beta[terms])),
-        turn * _deviations(records, of_terms(inverse[terms]), level * np.sqrt(shared / freedom)),
-        _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
+        turn * _by_sensor(records, of_terms(at.terms)),
+        turn * _deviations(records, of_terms(at.rows), at.share * at.level, of_terms(of_poles)),
+        _by_sensor(records, at.residues[:, : records.driven].sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
         _spikes(records, left),
-    )  # fmt: skip
+    )
 
 
 def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
@@ -191,15 +273,18 @@ def _by_sensor(records: Records, terms: Array) -> Array:
     return np.einsum("kic,di->kcd", plain, _of_base(records))
 
 
-def _deviations(records: Records, rows: Array, level: Array) -> Array:
+def _deviations(records: Records, rows: Array, level: Array, of_poles: Array) -> Array:
     """Deviations of the coefficients that rows (k, driven inputs, r) make of r independent errors of each channel.
 
-    Errors of the inputs, which are combinations of base directions, are not independent of one another.
+    Beside them those that the poles' errors make, (k, driven inputs, channels, s) of s independent ones. Errors of the
+    inputs, which are combinations of base directions, are not independent of one another.
     """
     if records.unit:
-        return _by_sensor(records, np.linalg.norm(rows, axis=2)[:, :, None] * level)
-    of_base = np.linalg.norm(np.einsum("di,kir->kdr", _of_base(records), rows), axis=2)
-    return np.asarray(of_base[:, None] * (level / records.channel)[:, None])
+        both = np.hypot(np.linalg.norm(rows, axis=2)[:, :, None] * level, np.linalg.norm(of_poles, axis=3))
+        return _by_sensor(records, both)
+    to_base = lambda x: np.linalg.norm(np.einsum("di,ki...->kd...", _of_base(records), x), axis=-1)  # noqa: E731
+    of_base = np.hypot(to_base(rows)[:, :, None] * level, to_base(of_poles)) / records.channel
+    return of_base.swapaxes(1, 2)
 
 
 def _of_base(records: Records) -> Array:

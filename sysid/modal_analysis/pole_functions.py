@@ -154,6 +154,16 @@ class Beside(NamedTuple):
         """Products of all columns with what a fit leaves (rows, c), those of the shared ones given, (columns, c)."""
         return self.functions.in_order([*(columns.T @ left[rows] for rows, columns in self.by_run), of_shared])
 
+    def pole_equations(self, products: Array, residues: Array) -> tuple[Array, Array]:
+        """Gauss-Newton matrix (2m, 2m) of poles with free residues (m, inputs, channels), and direction of descent.
+
+        The columns are `Records.pole_slopes`, and `products` theirs with what the fit leaves of the data.
+        """
+        each = np.concatenate([residues, residues]).reshape(products.shape)
+        by_pole = (2 * len(residues), residues.shape[1])
+        normal = (self.gram() * (each @ each.T)).reshape(by_pole * 2).sum(axis=(1, 3))
+        return normal, np.sum(products * each, axis=1).reshape(by_pole).sum(axis=1)
+
 
 def unit_columns(matrix: Array) -> tuple[Array, Array]:
     """Columns divided by their lengths, and these lengths; one for a column of zeros."""

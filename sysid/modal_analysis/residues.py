@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import separable
 from sysid.modal_analysis.pole_functions import Basis, Beside, OfRun, PoleFunctions, orthonormal, unit_columns
-from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
+from sysid.modal_analysis.response import columns, gains, gains_and_slopes, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
@@ -192,6 +192,12 @@ class Records:
         return PoleFunctions(
             np.concatenate([part.reshape(rows, m, -1) for part in shared], axis=2).reshape(rows, -1), inputs, by_run
         )
+
+    def pole_slopes(self, omega: Array, ratios: Array, *, velocity: bool) -> PoleFunctions:
+        """Derivatives of the columns of `functions` by log w_k, then by log zeta_k, as those of 2m poles."""
+        g, by_pole = gains_and_slopes(self.freq, omega, ratios)
+        turned = 2j * np.pi * self.freq / np.tile(omega, 2)[:, None] * (by_pole - np.concatenate([g, np.zeros_like(g)]))
+        return self.of_poles([by_pole, turned][: 1 + velocity])
 
     @property
     def _shared(self) -> int:

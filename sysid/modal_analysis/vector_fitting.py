@@ -18,7 +18,6 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
-from sysid.modal_analysis.response import gains_and_slopes
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance, round_off
@@ -391,14 +390,6 @@ def _polish(
 
 def _projected(records: Records, p: Array, fit: ResidueFit, velocity: bool) -> tuple[Array, Array]:
     """Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at the `fit` on log poles `p`."""
-    m = p.size // 2
-    omega, ratios = np.exp(p[:m]), np.exp(p[m:])
-    g, by_pole = gains_and_slopes(records.freq, omega, ratios)
-    turned = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None] * (by_pole - np.concatenate([g, np.zeros_like(g)]))
-    slopes = records.of_poles([by_pole, turned][: 1 + velocity])
+    slopes = records.pole_slopes(*np.exp(p.reshape(2, -1)), velocity=velocity)
     beside, products = fit.beside(slopes)
-    residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.size, -1)
-    d = slopes.per_pole
-    H = (beside.gram() * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
-    slope = np.sum(products * residues, axis=1).reshape(2 * m, d).sum(axis=1)
-    return H, slope
+    return beside.pole_equations(products, fit.residues)

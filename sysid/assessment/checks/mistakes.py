@@ -31,7 +31,6 @@ from sysid.structure.thresholds import AS_GOOD, CANDIDATES, MENDED, most_deviati
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
-_ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
 _LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
 _NONE = 0.1  # of a sensor's rigid-body motion; as good as none, or not known where the standard deviation is larger
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
@@ -137,7 +136,7 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     error = np.maximum(error, np.finfo(float).tiny)
     least = _TURN / (2 * np.pi * test.freq[-1])
     mean = float(np.average(delay, weights=error**-2))
-    off = (np.abs(delay) > _ONE_SURE * error) & (np.abs(delay) > least)
+    off = (np.abs(delay) > most_deviations(CANDIDATES) * error) & (np.abs(delay) > least)
     if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
         return None
     out = np.zeros(test.n_sensors)
