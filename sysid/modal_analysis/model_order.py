@@ -111,6 +111,8 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
         np.append(p.modes.ratios, np.full(d, ratio)),
     )  # fmt: skip
     first = replace(p, modes=modes, ends=np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
+    if monitor is not None:
+        monitor.doing = "modes above the lines"
     more = refitted(fit, first, monitor=monitor, static=d)
     unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
     inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]

@@ -16,6 +16,7 @@ from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import estimate, fit_modes
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
@@ -242,12 +243,19 @@ class Prepared(SearchSpace):
         self.modal = (modal, *self.modal[1:])
         return modal
 
-    def fit_static(self) -> ModalEstimate:
+    def fit_static(self, monitor: FitMonitor) -> None:
         """Let modes stand for all above the lines of the problem's own whole records, where these ask for it."""
         fit = self.modal[0].record_fit
-        if fit is not None and (more := with_static_modes(fit)) is not fit:
+        if fit is None:
+            return
+        monitor.keep(fit)
+        try:
+            with monitor.at_work():
+                more = with_static_modes(fit, monitor=monitor)
+        except (Stop, KeyboardInterrupt):
+            more = replace(fit, stopped=True)
+        if more is not fit:
             self.modal = (estimate(more), *self.modal[1:])
-        return self.modal[0]
 
     @property
     def answers_in_band(self) -> bool:

@@ -201,7 +201,7 @@ def structure_of_modes(
     if to_totals:
         known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
-        P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
+        P, gamma, residual = P * np.sqrt(t), gamma * np.sqrt(t), residual.scaled(np.sqrt(t))
     M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
     M_S0 = P.T @ gamma - M_SS @ G
     delta = gamma - P @ G
@@ -220,6 +220,10 @@ def structure_of_modes(
 
 def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     """Modes from the data, and the structure that they make."""
+    if problem.answers_in_band and options.modes is None and problem.modal[0].by_modes:
+        with session.fit_monitor() as watch:
+            problem.fit_static(watch)
+        session.finish()
     monitor = IterationMonitor(session.reporter("local phase"), session.left)
     try:
         structure, end, chosen, poles = modal_structure(problem, options, monitor)
@@ -319,6 +323,7 @@ def modal_structure(
         t = _modal_masses(problem, modes, chosen)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
+        residual = residual.without_mass(problem.totals)  # nothing weighs them
     # A stated total is kept, even where the base force weighs another.
     unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
     try:
@@ -359,8 +364,6 @@ def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: Iterati
             f"{modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "
             "the band, or take estimator='h1'"
         )
-    if problem.answers_in_band and options.modes is None:
-        modal = problem.fit_static()
     residual = residual_of(modal, modal.modes)
     return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "", static=modal.static)
 
@@ -434,19 +437,16 @@ def _free_spectrum(
         # In units of the half-power half-width, which is what frequencies are known in.
         # Cut off where no step of use leads.
         room = np.where(held, 0.0, np.inf)
-        shift = _within(z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios), 1.0)
+        shift = z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios)
         with np.errstate(divide="ignore"):
             low, high = (np.where(held, 0.0, np.log(limit / ratios)) for limit in (lower, upper))
-        loss = _within(z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high), 10.0)
+        loss = z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high)
+        shift, loss = ca.fmin(ca.fmax(shift, -1.0), 1.0), ca.fmin(ca.fmax(loss, -10.0), 10.0)
         moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
         # Entries of a scalar are a row.
         return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
 
     return spectrum
-
-
-def _within(value: ca.MX, limit: float) -> ca.MX:
-    return ca.fmin(ca.fmax(value, -limit), limit)
 
 
 def _modal_masses(problem: Prepared, modes: Modes, chosen: DegreesOfFreedom) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,6 +80,16 @@ class ResidualModes:
     def omega(self) -> Array:
         """Circular frequencies, rad/s, (r,)."""
         return 2 * np.pi * self.natural_frequencies
+
+    def scaled(self, factor: float | Array) -> ResidualModes:
+        """The same answer of the sensors, by modes of `factor`, one or (r,), times the participation."""
+        participation = np.reshape(factor, (-1, 1)) * self.participation
+        return replace(self, shapes=self.shapes / factor, participation=participation)
+
+    def without_mass(self, totals: Array) -> ResidualModes:
+        """The same answer of the sensors, by modes of a millionth of the totals (d,), where nothing weighs them."""
+        size = np.linalg.norm(self.participation / np.sqrt(totals), axis=1)
+        return self.scaled(1e-3 / np.maximum(size, np.finfo(float).tiny))
 
     def motion(self, freq: Array) -> ComplexArray:
         """Modal accelerations at lines in Hz per unit base acceleration, (r, d, n_freq)."""

@@ -185,3 +185,16 @@ def test_a_structure_without_modes_above_has_none(random_structure):
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
     assert isinstance(result.structure, Structure) and result.structure.residual.count == 0
     assert result.structure.at_sensors and result.determined
+
+
+def test_without_a_force_they_answer_at_the_sensors_and_weigh_nothing(truth):
+    """Nothing tells their masses: none is made up, in the base force as in the superelement."""
+    test = sysid.simulate(truth, np.linspace(2.0, 15.0, 400), noise=0.005, rng=0)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass(40.0)), rng=0)
+    s = result.structure
+    assert s.residual.count and s.n == 4 and not result.determined
+    assert result.residual < 1.05 * test.residual(truth)
+    assert np.abs(s.residual.participation).max() < 1.1e-3 * np.sqrt(40.0)
+    mass = s.to_craig_bampton().mass
+    size = np.sqrt(np.diag(mass))
+    assert np.linalg.eigvalsh(mass / np.outer(size, size))[0] > -1e-9
