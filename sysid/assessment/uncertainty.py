@@ -253,6 +253,9 @@ def moves_by_records(
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
+    if modal.by_modes and modal.static:  # which turns change nothing holds where their information was taken
+        at = slice(-modal.static, None)
+        modes.phi[:, at], modes.gamma[at] = modal.phi[:, at], modal.gamma[at]
     test = modal.records
     index = Index(structure.n_sensors, modes.omega.size, structure.n_base)
     path = parametrisation(problem, structure, modes, index)

@@ -114,10 +114,14 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     if monitor is not None:
         monitor.doing = "modes above the lines"
     more = refitted(fit, first, monitor=monitor, static=d)
+    passed = more.parameters.modes.omega > far * (1 + ROUND_OFF)
+    if np.any(passed):  # they stand for what the static modes do
+        more = refitted(more, without(more, passed), monitor=monitor)
     unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
     inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]
     gained = 2 * (more.likelihood - fit.likelihood)
-    if not more.settled or inside[0] != inside[1] or gained < beyond_chance(unknowns):
+    passed = more.parameters.modes.omega > far * (1 + ROUND_OFF)
+    if not more.settled or np.any(passed) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
     return _in_gauge(more)
 

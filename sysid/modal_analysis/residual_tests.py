@@ -195,7 +195,7 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     """The same, whatever is left, over partitions that begin later each: where blocks begin must not matter."""
     model, p = fit.model, fit.parameters
     N, size = unit_diagonal(fit.normal)
-    half = half_inverse(N, 1e-12)
+    half, size = half_inverse(N, 1e-12), np.where(model.held, np.inf, size)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
     for shift in np.arange(partitions) / partitions:

@@ -18,7 +18,7 @@ from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
+from sysid.structure.thresholds import CANDIDATES, EXACT, ROUND_OFF, beyond_chance
 
 Integers = NDArray[np.intp]
 
@@ -136,20 +136,28 @@ class ModeFit:
         omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
         kept = self._worthwhile(omega, ratios)
         omega, ratios = omega[kept], ratios[kept]
-        fit, counts = (
-            replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=d),
-            np.ones(kept.size, int),
-        )
-        counts[-1] = d
-        more = fit._grown(fit.of_modes(counts), counts)
+        more = self._beside_static(omega, ratios)
+        far = times * last * (1 + ROUND_OFF)
+        stays = more.modes.omega[separate_poles(more.modes)[0]] < far
+        if not np.all(stays):  # a pole that passes the static modes stands for what they do
+            omega, ratios = omega[stays], ratios[stays]
+            more = self._beside_static(omega, ratios)
         inside = np.count_nonzero(omega < last), np.count_nonzero(np.unique(more.modes.omega) < last)
-        if more.status != "settled" or inside[0] != inside[1]:  # a pole that comes into the lines is no mode
+        # One that comes into the lines is no mode.
+        if more.status != "settled" or inside[0] != inside[1] or np.any(more.modes.omega > far):
             return best
         unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
         gained = (best.residual**2 - more.residual**2) * self.records.size
         free = self.records.fit(omega, ratios)
         noise = self.records.noise(free.left, free.residues.size)
         return more if gained > np.sign(unknowns) * beyond_chance(max(abs(unknowns), 1)) * noise else best
+
+    def _beside_static(self, omega: Array, ratios: Array) -> ModalFit:
+        """Fit of modes at these poles, as many as base directions at the last, which is held."""
+        fit = replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=self.test.n_base)
+        counts = np.ones(omega.size, dtype=int)
+        counts[-1] = fit.static
+        return fit._grown(fit.of_modes(counts), counts)
 
     def _worthwhile(self, omega: Array, ratios: Array) -> Integers:
         """Poles that noise does not explain beside the last one: some stood for what that explains."""

@@ -14,7 +14,7 @@ nearest to a lumped mass is taken.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -202,7 +202,8 @@ class EstimateResidual:
     """Misfit of modes to an estimate, in units of its noise and of the records, the best shapes eliminated.
 
     Half a chi-squared rises by ``|R (theta - estimate)|²``, with ``R' R`` the information; shapes enter it linearly.
-    `phi` (n, m) are the best shapes, `value` is the sum of squares.
+    `phi` (n, m) are the best shapes, `value` is the sum of squares. The scale of static modes, which the force alone
+    tells, may be far off: accelerations see none of it, and the force its square.
     """
 
     def __init__(self, modal: ModalEstimate, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX) -> None:
@@ -211,18 +212,24 @@ class EstimateResidual:
         self.size = weights_of_test(test, weighted=True)[0][1]
         factor = factor_of(modal) / self.size
         theta, at = theta_of(modal.modes, modal.rigid, index), index.gamma.start
-        scale = scale_in(modal, gamma)
-        if test.force is not None:
-            scale = ca.sign(scale)
-        corner = [rigid[i, j] for i, j in index.pairs]
-        moved = ca.vertcat(ca.vec((gamma / ca.repmat(scale, 1, test.n_base)).T), ca.log(omega), ca.log(ratios), *corner)
-        off = moved - ca.DM(theta[at:])
+        scale, shift = self._scales(scale_in(modal, gamma), ca.sign)
+        corner, d = [rigid[i, j] for i, j in index.pairs], test.n_base
+        pushed = gamma / ca.repmat(scale, 1, d) + ca.DM(modal.gamma) * ca.repmat(shift, 1, d)
+        off = ca.vertcat(ca.vec(pushed.T), ca.log(omega), ca.log(ratios), *corner) - ca.DM(theta[at:])
+        shapes = ca.DM(modal.phi) * ca.repmat(1 + shift.T, test.n_sensors, 1)
         U, s, vt = np.linalg.svd(factor[:, :at], full_matrices=False)
         seen = s > round_off(s.size) * s[0]
         onto = U[:, seen].T @ factor[:, at:]
         self.value = ca.sumsqr(ca.DM(np.linalg.qr(factor[:, at:] - U[:, seen] @ onto, mode="r")) @ off)
-        best = ca.DM(theta[:at]) - ca.DM((vt[seen].T / s[seen]) @ onto) @ off
+        best = ca.vec(shapes.T) - ca.DM((vt[seen].T / s[seen]) @ onto) @ off
         self.phi = ca.reshape(best, *modal.phi.T.shape).T / ca.repmat(scale.T, test.n_sensors, 1)
+
+    def _scales(self, scale: Any, sign: Callable[[Any], Any]) -> tuple[Any, Any]:
+        """Participations over the estimate's, (m, 1), as far as accelerations leave them open, and half the force's."""
+        if self.modal.records.force is None:
+            return scale, 0 * scale
+        static = (np.arange(len(self.modal.omega))[:, None] >= len(self.modal.omega) - self.modal.static).astype(float)
+        return static * scale + (1 - static) * sign(scale), static * (scale**2 - 1) / 2
 
     def derivatives(self, z: NonlinearProgram) -> None:
         """None of its own: CasADi's are as fast."""
@@ -230,10 +237,11 @@ class EstimateResidual:
     def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
         """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""
         modal, index = self.modal, index_of(self.modal)
-        scale = np.sum(modes.gamma * modal.gamma, axis=1) / np.sum(modal.gamma**2, axis=1)
-        if modal.records.force is not None:
-            scale = np.sign(scale)
-        scaled = modes._replace(phi=modes.phi * scale, gamma=modes.gamma / scale[:, None])
+        apart = np.sum(modes.gamma * modal.gamma, axis=1) / np.sum(modal.gamma**2, axis=1)
+        scale, shift = self._scales(apart[:, None], np.sign)
+        scaled = modes._replace(
+            phi=modes.phi * scale.T - modal.phi * shift.T, gamma=modes.gamma / scale + modal.gamma * shift
+        )  # fmt: skip
         off = theta_of(scaled, rigid, index) - theta_of(modal.modes, modal.rigid, index)
         risen = float(np.linalg.norm(factor_of(modal) @ off)) / self.size
         return risen, float(np.hypot(risen, residual_of(modal, modal.modes))), residual_of(modal, modes)

@@ -11,8 +11,10 @@ from benchmarks.band.structures import structure as continuous_structure
 from benchmarks.records.simulated import Modes as SimulatedModes
 from benchmarks.records.simulated import Run, random_motion, with_noise
 from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.residual_tests import scatter_over_blocks
 from sysid.structure.structure import Structure
 
 
@@ -177,6 +179,25 @@ def test_poles_that_stood_for_modes_above_the_lines_go():
     truth = continuous_structure(6)
     result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
     assert result.structure.n == truth.count == 5 and result.structure.residual.static == 3 and result.determined
+
+
+def test_more_mass_than_is_spare_is_taken_off_static_modes_without_harm_to_the_accelerations():
+    """Whole records of a plate, whose likeliest static modes would leave the base a negative mass."""
+    truth = continuous_structure(41)
+    result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
+    modal, s = result.modal[0], result.structure
+    weighs = modal.rigid - modal.gamma.T @ modal.gamma
+    assert modal.static == 2 and np.linalg.eigvalsh(weighs)[0] < 0
+    form = s.to_craig_bampton().mass
+    assert np.linalg.eigvalsh(form)[0] > -1e-9 * np.abs(form).max()
+    assert result.determined and result.residual < 1.05 * residual_of(modal, modal.modes)
+
+
+def test_scatter_over_blocks_leaves_what_is_held_out(fits):
+    """Where noise alone is left it is about the information, of which nothing is known of a pole that is held."""
+    B, A = scatter_over_blocks(fits[1]), fits[1].information()
+    assert np.all(np.isfinite(B)) and not np.any(B[fits[1].model.held[: len(B)]])
+    assert np.trace(B) == pytest.approx(np.trace(A), rel=0.4)
 
 
 def test_a_structure_without_modes_above_has_none(random_structure):
