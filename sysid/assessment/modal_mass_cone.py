@@ -82,6 +82,8 @@ def _in_band_in_words(test: Measurement, structure: Structure) -> str:
     what = f"{structure.n} modes on {sensors} of {structure.n_sensors} sensors" + (
         f" and {others} modal coordinates, which the Craig-Bampton form (to_craig_bampton()) holds" if others else ""
     )
+    if structure.n < structure.n_sensors:
+        what += "; a mode that the base does not excite is not among them"
     if beyond.count:
         added = np.einsum("sk,kdf,rdf->rsf", beyond.shapes, beyond.motion(test.freq), test.base)
         share = np.linalg.norm(added) / np.linalg.norm(test.relative)
