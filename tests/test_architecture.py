@@ -30,7 +30,7 @@ CEILINGS = {
     # and transients of runs eliminated run by run, noise levels and further modes of low rank (210),
     # and signs, gains and delays on settled poles, whose errors count (105),
     # and modes beyond the lines, which answer in the band and are none of the structure's (450).
-    "lines": 40_438,
+    "lines": 40_488,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

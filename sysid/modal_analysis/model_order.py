@@ -128,10 +128,10 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
 
 def _rise(fit: RecordFit) -> tuple[float, Array]:
     """Chi-squared of what grows as w² in the sensors, which a fit follows; its size where none does, (n, d)."""
-    (n, d), at, equations = fit.test.rigid_body.shape, fit.model.size, fit.equations
-    asked = slice(at + n * d, at + 2 * n * d)
-    seen = np.r_[np.arange(at), np.arange(asked.start, asked.stop)]
-    normal, size = unit_diagonal(equations.normal[np.ix_(seen, seen)])
+    (n, d), equations = fit.test.rigid_body.shape, fit.equations
+    at = fit.model.size + n * d  # beside constants too, which wrong gains make
+    seen = slice(at + n * d)
+    normal, size = unit_diagonal(equations.normal[seen, seen])
     half = half_inverse(normal[:at, :at], ROUND_OFF)
     across, gradient = half.T @ normal[:at, at:], equations.gradient[seen] / size
     left = gradient[at:] - across.T @ (half.T @ gradient[:at])

@@ -26,8 +26,8 @@ _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 
 
 def fit_modes_of_lines(
-    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, residual: bool, monitor: IterationMonitor,
-    max_iterations: int,
+    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, residual: bool = False,
+    monitor: IterationMonitor, max_iterations: int,
 ) -> ModalEstimate:  # fmt: skip
     """Fit modes at the poles of a test whose lines stand for themselves: its estimate with these, ascending.
 
@@ -171,13 +171,18 @@ class ModeFit:
         return kept
 
     def _misses_static(self, best: ModalFit) -> bool:
-        """True where what free residues leave at the poles of a fit grows as w², beyond chance."""
+        """True where what free residues leave at the poles of a fit grows as w², beyond chance.
+
+        Beside a constant, which a wrong gain makes.
+        """
         records, first = self.records, separate_poles(best.modes)[0]
         if best.of_accelerations <= EXACT:
             return False
         free = records.fit(best.modes.omega[first], best.modes.ratios[first])
-        rising = records.basis(modes_above(self.test.freq, self.test.freq[-1])[:1] + 0j)
-        along = np.linalg.qr(rising - free.Q @ (free.Q.T @ rising))[0].T @ free.left
+        rise = modes_above(self.test.freq, self.test.freq[-1])[:1]
+        beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
+        rising = records.basis(rise + 0j)
+        along = np.linalg.qr(rising - beside @ (beside.T @ rising))[0].T @ free.left
         noise = records.noise(free.left, free.residues.size)
         return bool(np.sum(along**2) > noise * beyond_chance(along.size))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import runpy
+
 import numpy as np
 import pytest
 
-from sysid import FullMass, Problem, identify, simulate
+from sysid import FullMass, Problem, catalogue, identify, simulate
 from sysid.modal_analysis.vector_fitting import find_poles
 
 
@@ -52,3 +54,15 @@ def test_the_force_is_answered_too(truth, band):
     result = identify(Problem(test, mass=FullMass()))
     np.testing.assert_allclose(result.structure.rigid_body_mass, truth.rigid_body_mass, rtol=1e-6)
     assert result.force_residual < 1e-8
+
+
+def test_the_cantilever_in_band_is_found_within_its_deviations(identified):
+    result = identified("cantilever_in_band")
+    truth = runpy.run_path(str(catalogue.bundled_folder() / "cantilever_in_band.py"))["mast"]()
+    s, u, freq = result.structure, result.uncertainty, result.measurement.freq
+    assert result.determined and (s.n, s.n_sensors) == (4, 8)
+    for name in ("natural_frequencies", "damping_ratios", "effective_masses"):
+        off = (getattr(s, name) - getattr(truth, name)[:4]) / getattr(u, name)
+        assert np.abs(off).max() < 4, name
+    for found, right in ((s.transmissibility, truth.transmissibility), (s.base_force, truth.base_force)):
+        assert np.linalg.norm(found(freq) - right(freq)) < 2e-3 * np.linalg.norm(right(freq))

@@ -20,6 +20,7 @@ MODULES = {
     path.stem: path for folder in ("problems", "tests/modules_from_readme") for path in (ROOT / folder).glob("[!_]*.py")
 }
 del MODULES["recorded_test"]  # it is the file that it is given
+del MODULES["cantilever_in_band"]  # younger than the table: test_outside.py compares it with its truth
 SETTINGS = {"cantilever_tower": {"noise": 0.0, "force": False}}  # its defaults when the table was made
 RECORDS = os.environ.get("SYSID_DATA") or ROOT.parent / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
 DATA = {"mini_shake_table": str(RECORDS)}
