@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,15 @@ class Worker:
         assert self.process.stdin is not None
         self.process.stdin.close()
         self.process.wait()
+
+
+def answer_cases(answer: Callable[..., object]) -> None:
+    """Answer case after case, each a list of arguments on a line of JSON, on one thread: all that a script does."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1):
+        for line in sys.stdin:
+            print(json.dumps(answer(*json.loads(line))), flush=True)
 
 
 @contextlib.contextmanager

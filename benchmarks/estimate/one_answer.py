@@ -6,15 +6,13 @@ judgement, M, K and C, and their deviations.
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 import sysid
 from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.older import answer_cases
 from benchmarks.records import trial
 from benchmarks.records.simulated import coupled
 
@@ -48,12 +46,5 @@ def answer(what: str, seed: int) -> dict[str, Any]:
     return {"judgement": word, "against": [str(one) for one in against], **matrices, **deviations}
 
 
-def main() -> None:
-    """Answer case after case."""
-    with threadpool_limits(limits=1):
-        for line in sys.stdin:
-            print(json.dumps(answer(*json.loads(line))), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    answer_cases(answer)

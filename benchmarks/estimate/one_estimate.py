@@ -7,16 +7,14 @@ from samples to a judged answer.
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 import sysid
 from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.older import answer_cases
 from benchmarks.records import record_speed, trial
 from benchmarks.records.simulated import coupled_structure
 from sysid.nlp import IterationMonitor
@@ -57,12 +55,5 @@ def seconds_of(what: str, *case: int) -> float:
     return time.process_time() - begun
 
 
-def main() -> None:
-    """Answer case after case."""
-    with threadpool_limits(limits=1):
-        for line in sys.stdin:
-            print(json.dumps(seconds_of(*json.loads(line))), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    answer_cases(seconds_of)
