@@ -262,5 +262,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
-        record_fit=replace(fit), static=fit.static,
+        record_fit=fit, static=fit.static,
     )  # fmt: skip

@@ -16,6 +16,8 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, gains, stacked
 from sysid.structure.structure import Array, ComplexArray
 
+# Pole of modes that stand for all above the lines: times the last line, where masses stay positive, and damping ratio.
+STATIC_POLE = 2.0, 0.01
 _TURNED = 0.25  # of what a base force leaves; of one with a wrong sign less is left when it is turned
 _MOST = 0.5  # of the power of a base force, the least that a fit must explain to tell its sign
 
@@ -117,10 +119,6 @@ def held_gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray
             gauge[same] = np.linalg.solve(gauge[block], gauge[same])
             held[block] = True
     return gauge, held
-
-
-STATIC_POLE = 2.0, 0.01  # of modes that stand for all above the lines: times the last line, where masses stay
-# positive, and damping ratio
 
 
 def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes:

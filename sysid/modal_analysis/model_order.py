@@ -111,17 +111,16 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
         np.append(p.modes.ratios, np.full(d, ratio)),
     )  # fmt: skip
     first = replace(p, modes=modes, ends=np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
-    if monitor is not None:
-        monitor.doing = "modes above the lines"
+    monitor = monitor or FitMonitor()
+    monitor.doing = "modes above the lines"
     more = refitted(fit, first, monitor=monitor, static=d)
-    passed = more.parameters.modes.omega > far * (1 + ROUND_OFF)
-    if np.any(passed):  # they stand for what the static modes do
-        more = refitted(more, without(more, passed), monitor=monitor)
+    passed = lambda one: one.parameters.modes.omega > far * (1 + ROUND_OFF)  # noqa: E731
+    if np.any(passed(more)):  # they stand for what the static modes do
+        more = refitted(more, without(more, passed(more)), monitor=monitor)
     unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
     inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]
     gained = 2 * (more.likelihood - fit.likelihood)
-    passed = more.parameters.modes.omega > far * (1 + ROUND_OFF)
-    if not more.settled or np.any(passed) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
+    if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
     return _in_gauge(more)
 
