@@ -77,33 +77,31 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
     with one_thread():
-        every = found = _of_accelerations(still)
+        every = at = _relocated(still)
         for _ in range(3):  # times that lines with spikes are left out
-            if found is None or not found[1].spikes.any():
+            if at is None or not at.spikes.any():
                 break
-            still = still.at(~found[1].spikes)
-            found = _of_accelerations(still)
-        if every is None or found is None:
+            still = still.at(~at.spikes)
+            at = _relocated(still)
+        if every is None or at is None:
             return None
-        at, rigid = found
+        at = _settled(at)
+        rigid = _fitted(at, at.errors)
         force = None if test.force is None else _fitted(_AtPoles(Records(still, force=True), at.poles), at.errors)
     (const, slope), (const_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every[1].misfit
+        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every.misfit
     )
 
 
-def _of_accelerations(still: Measurement) -> tuple[_AtPoles, _Fit] | None:
-    """Fit on poles as they are likeliest; None where the base moves in too few directions, or no pole is found."""
+def _relocated(still: Measurement) -> _AtPoles | None:
+    """Fit of the accelerations; None where the base moves in too few directions, or no pole is found."""
     records = Records(still)
     if not records.unit and records.driven < still.n_base:
         return None
     poles = _poles(records)
-    if poles is None:
-        return None
-    at = _settled(_AtPoles(records, np.log(poles).ravel()))
-    return at, _fitted(at, at.errors)
+    return None if poles is None else _AtPoles(records, np.log(poles).ravel())
 
 
 def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
@@ -112,14 +110,12 @@ def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
     Each channel has its own level of noise. No pole leaves the lines downwards, where modes show by their tail.
     """
     damping, longest = 10 * least, 0.3
-    lowest = np.log(2 * np.pi * best.records.freq[best.records.freq > 0][0])
     for _ in range(steps):
         step, moved = best.step(damping)
         if np.max(np.abs(moved)) < 1:
             break
-        omega, ratios = (best.poles + np.clip(step, -longest, longest)).reshape(2, -1)
-        poles = np.concatenate([np.maximum(omega, lowest), np.minimum(ratios, np.log(_MODE))])
-        trial = _AtPoles(best.records, poles)
+        poles = best.poles + np.clip(step, -longest, longest)
+        trial = _AtPoles(best.records, np.clip(poles, *best.ends))
         better = np.sum(np.log(trial.level)) < np.sum(np.log(best.level))
         best, damping = (trial, max(damping / 10, least)) if better else (best, 10 * damping)
     return best
@@ -180,6 +176,24 @@ class _AtPoles:
         self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
 
     @cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """Least and largest log w_k and log zeta_k, (2m,) each."""
+        least, most = np.full((2, *self.poles.shape), [[-np.inf], [np.inf]])
+        least[: self.omega.size] = np.log(2 * np.pi * self.records.freq[self.records.freq > 0][0])
+        most[self.omega.size :] = np.log(_MODE)
+        return least, most
+
+    @property
+    def misfit(self) -> float:
+        """Relative residual."""
+        return float(np.linalg.norm(self.left) / np.sqrt(self.records.size))
+
+    @property
+    def spikes(self) -> NDArray[np.bool_]:
+        """Lines (n_freq,) that are far off."""
+        return _spikes(self.records, self.left)
+
+    @cached_property
     def by_poles(self) -> tuple[Array, Array, Array]:
         """Normal matrix of the poles, descent, each channel in units of its level, and slopes of the terms.
 
@@ -215,7 +229,10 @@ class _AtPoles:
     def step(self, damping: float) -> tuple[Array, Array]:
         """A damped step of the poles, and how far it moves the terms, in units of their deviations at fixed poles."""
         normal, descent, by_pole = self.by_poles
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), descent)
+        free = ~np.where(descent > 0, self.poles >= self.ends[1], self.poles <= self.ends[0])
+        step = np.zeros_like(descent)
+        damped = normal + damping * np.diag(np.diag(normal))
+        step[free] = np.linalg.solve(damped[np.ix_(free, free)], descent[free])
         std = np.linalg.norm(self.rows, axis=1)[:, None] * self.level / np.sqrt(max(len(self.left) - self.count, 1))
         return step, np.tensordot(step, by_pole, 1) / std
 
@@ -224,24 +241,18 @@ class _AtPoles:
 class _Fit:
     """Coefficients of the functions 1 and i w (2, channels, d), their deviations, and the sum of residues.
 
-    Whether modes below the lines show, the relative residual, and lines (n_freq,) that are far off.
+    Whether modes below the lines show.
     """
 
     terms: Array
     std: Array
     modal: Array
     below: bool
-    misfit: float
-    spikes: NDArray[np.bool_]
 
 
 def _fitted(at: _AtPoles, errors: Array) -> _Fit:
     """The fit in the test's own units, the slopes per rad/s; `errors` (2m, r) of the poles are independent ones."""
-    records, left = at.records, at.left
-    tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
-    beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
-    gained = float(np.sum((beyond.T @ left) ** 2))
-    noise = records.noise(left, at.count * left.shape[1])
+    records = at.records
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(2, records.driven, *x.shape[1:])  # noqa: E731
     of_poles = np.tensordot(at.by_poles[2], errors, (0, 0))
@@ -249,10 +260,21 @@ def _fitted(at: _AtPoles, errors: Array) -> _Fit:
         turn * _by_sensor(records, of_terms(at.terms)),
         turn * _deviations(records, of_terms(at.rows), at.share * at.level, of_terms(of_poles)),
         _by_sensor(records, at.residues[:, : records.driven].sum(axis=0, keepdims=True))[0],
-        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES),
-        float(np.linalg.norm(left) / np.sqrt(records.size)),
-        _spikes(records, left),
+        _shows_below(at),
     )
+
+
+def _shows_below(at: _AtPoles) -> bool:
+    """True where modes below the lines leave what falls as 1/w², poles held at the first line left out."""
+    inside = (at.poles > at.ends[0])[: at.omega.size]
+    records = at.records
+    if not inside.all() and inside.any():
+        at = _AtPoles(records, at.poles.reshape(2, -1)[:, inside].ravel())
+    tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
+    beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
+    gained, left = float(np.sum((beyond.T @ at.left) ** 2)), at.left
+    noise = records.noise(left, at.count * left.shape[1])
+    return gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES)
 
 
 def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
