@@ -70,8 +70,8 @@ def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> Record
 
 def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
     """Refuse modes of records of a steady sine where no other line shows them."""
-    sentence = steady_sine(test)
-    if sentence is not None and (not fit.settled or at_sines_alone(test, fit.parameters.modes.omega)):
+    sentence, modes = steady_sine(test), fit.parameters.modes
+    if sentence is not None and (not fit.settled or at_sines_alone(test, modes.omega, modes.ratios)):
         raise InputError(sentence)
 
 

@@ -68,9 +68,14 @@ def steady_sine(test: Measurement) -> str | None:
     )
 
 
-def at_sines_alone(test: Measurement, omega: Array) -> bool:
-    """True where the base moves in steady sines, and no other line or mode, rad/s, away from them tells anything."""
-    found, f = _sines(test), omega / (2 * np.pi)
+def at_sines_alone(test: Measurement, omega: Array, ratios: Array) -> bool:
+    """True where the base moves in steady sines, and no other line or mode, rad/s, away from them tells anything.
+
+    Modes within half their width of another are none: two that cancel each other fit noise beside the sine.
+    """
+    found = _sines(test)
+    apart = np.abs(np.log(omega / omega[:, None])) + np.diag(np.full(omega.size, np.inf))
+    f = omega[np.all(apart > ratios, axis=0)] / (2 * np.pi)
     if found is None or _sines(test, share=1 - ROUND_OFF) is not None:  # at other lines the base does not move
         return found is not None
     spacing = np.max(np.diff(test.freq))

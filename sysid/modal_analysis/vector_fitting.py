@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -142,6 +143,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     fit = records.fit(found, ratios)
     # By its place, or by what the fit would lose without it.
     lacking = (off > np.log1p(window)) | (fit.gain < _least_gain(fit) * _noise(records, fit, found.size))
+    lacking |= ~_may_be_modes(records, found, ratios)
     if np.any(lacking):
         stated, ends = (
             ", ".join(f"{value:.5g}" for value in values[lacking] / (2 * np.pi)) for values in (distinct, found)
@@ -336,10 +338,7 @@ def _prune(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
-    lines = 2 * np.pi * records.freq[records.freq > 0]
-    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < DAMPED)
-    inside &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))
-    kept = np.flatnonzero(inside)  # what is no mode goes first, whatever it explains
+    kept = np.flatnonzero(_may_be_modes(records, omega, ratios))  # others go first, whatever they explain
     subsets = None
     while kept.size:
         if subsets is None or 2 * kept.size < subsets.size:
@@ -354,10 +353,21 @@ def _prune(
     return omega[kept], ratios[kept]
 
 
+def _may_be_modes(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
+    """Poles that are neither far outside the lines, nor damped as no structure is, nor of a single bad line, (m,)."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < DAMPED)
+    broad = ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))
+    return inside & (broad | (omega > lines[-1]))
+
+
 def _polish(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
-    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
+    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated.
+
+    It ends where a pole can be no mode any more, which is to go before the others are worth polishing.
+    """
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping, failed = 1e-3, np.array(np.inf)  # the step from here that failed last
@@ -374,10 +384,10 @@ def _polish(
             continue
         trial = p + step
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
-        other = records.fit(*np.exp(trial.reshape(2, m)), velocity=velocity)
+        other = records.fit(*_poles(trial), velocity=velocity)
         if other.squared_error < error:
             p, fit, damping = trial, other, max(damping / 10, 1e-12)
-            if error - fit.squared_error < NEGLIGIBLE * error:
+            if error - fit.squared_error < NEGLIGIBLE * error or not np.all(_may_be_modes(records, *_poles(p))):
                 break
             H, slope = _projected(records, p, fit, velocity)
             failed = np.array(np.inf)
@@ -385,11 +395,17 @@ def _polish(
             failed, damping = step, 10 * damping
             if damping > 1e6:
                 break
-    return np.exp(p[:m]), np.exp(p[m:])
+    return _poles(p)
+
+
+def _poles(p: Array) -> tuple[Array, Array]:
+    """Circular frequencies and damping ratios of log poles (2m,)."""
+    omega, ratios = np.exp(p.reshape(2, -1))
+    return omega, ratios
 
 
 def _projected(records: Records, p: Array, fit: ResidueFit, velocity: bool) -> tuple[Array, Array]:
     """Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at the `fit` on log poles `p`."""
-    slopes = records.pole_slopes(*np.exp(p.reshape(2, -1)), velocity=velocity)
+    slopes = records.pole_slopes(*_poles(p), velocity=velocity)
     beside, products = fit.beside(slopes)
     return beside.pole_equations(products, fit.residues)

@@ -20,9 +20,10 @@ def measured(records: Records) -> sysid.Measurement:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("cycles", "noise"), [(129.0, 0.0), (129.0, 0.01), (129.4, 0.0)])
-def test_a_steady_sine_is_told_and_no_unit_or_sign_is_accused(cycles: float, noise: float) -> None:
-    f, rng = cycles / 30.0, np.random.default_rng(0)
+@pytest.mark.parametrize(("cycles", "noise", "seed"), [(129, 0, 0), (129, 0.01, 0), (129, 0.01, 16), (129.4, 0, 0)])
+def test_a_steady_sine_is_told_and_no_unit_or_sign_is_accused(cycles: float, noise: float, seed: int) -> None:
+    """Also where noise beside it passes for two modes of one frequency (the second and third)."""
+    f, rng = cycles / 30.0, np.random.default_rng(seed)
     turn = np.exp(2j * np.pi * f * np.arange(30 * int(RATE)) / RATE)
     H, Z = SETTING.structure.transmissibility([f])[:, 0], SETTING.structure.base_force([f])[0]
     records = Records(turn.real[None], (H * turn).real, (Z * turn).real, RATE)
