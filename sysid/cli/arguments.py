@@ -119,7 +119,8 @@ def _add_run(command: Adder) -> None:
     run = command(
         "run",
         summary="identify the structure of a problem",
-        description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5). "
+        description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5: full "
+        "mass, free stiffness and modal damping, of the modes within the lines). "
         "Writes result.h5, summary.json and report.html.",
         examples=(
             "sysid run cantilever_tower",

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, as_float, choice, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.models.mass import FullMass
 from sysid.models.model import Geometry, MatrixModel
 from sysid.models.stiffness_and_damping import ModalDamping, SpectralStiffness
 from sysid.models.unknowns import Variable, user_site
@@ -32,9 +33,9 @@ class StatedProblem:
     """
 
     measurement: Measurement
-    mass: Any = field(kw_only=True)
-    stiffness: Any = field(default_factory=SpectralStiffness, kw_only=True)
-    damping: Any = field(default_factory=ModalDamping, kw_only=True)
+    mass: Any = field(default=FullMass(healing="rigid_body"), kw_only=True)
+    stiffness: Any = field(default=SpectralStiffness(), kw_only=True)
+    damping: Any = field(default=ModalDamping(), kw_only=True)
     residuals: Sequence[Any] = field(default=(), kw_only=True)
     constraints: Sequence[Any] = field(default=(), kw_only=True)
     misfit: Any = field(default=None, kw_only=True)
