@@ -22,7 +22,7 @@ from sysid.problem import stored
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, as_models, geometry_of
 from sysid.problem.terms import FurtherTest
-from sysid.structure.structure import Structure
+from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,9 +136,15 @@ class StatedProblem:
         return self.mass, self.stiffness, self.damping
 
     @property
+    def frequencies(self) -> Array:
+        """Natural frequencies that the stiffness states, Hz, so that none are looked for; (0,) where it states none."""
+        given = getattr(self.stiffness, "natural_frequencies", None)
+        return np.zeros(0) if given is None else np.atleast_1d(np.array(given, dtype=float))
+
+    @property
     def states_frequencies(self) -> bool:
-        """True where the stiffness states natural frequencies of its own, so that none are looked for."""
-        return getattr(self.stiffness, "natural_frequencies", None) is not None
+        """True where the stiffness states natural frequencies of its own."""
+        return self.frequencies.size > 0
 
     @cached_property
     def declared(self) -> Formulation:
