@@ -51,6 +51,12 @@ def within(omega: Array, ends: Array, stated: Array | None = None, window: float
     return near
 
 
+def too_few(found: int, asked: int) -> str:
+    """Why so many modes cannot be given, in words."""
+    there = "1 mode stands" if found == 1 else f"{found} modes stand"
+    return f"{there} out of the noise, fewer than the {asked} asked for"
+
+
 def separate_poles(modes: Modes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first mode of each pole, in ascending order of these modes, and the pole of each mode, (m,)."""
     _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)

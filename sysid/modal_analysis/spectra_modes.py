@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, weigh
+from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, too_few, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
 from sysid.modal_analysis.spectra_model import fit_spectra
@@ -67,8 +67,7 @@ def fit_modes_of_lines(
     if count is not None:
         fit, ours, counts = fit.at_strongest(count, every if inside is None else inside)
         if counts[ours].sum() < count:
-            few = f"{counts[ours].sum()} modes stand out of the noise, fewer than the {count} asked for"
-            return replace(modal, lacking=few)
+            return replace(modal, lacking=too_few(counts[ours].sum(), count))
     if not monitor.allows(fit.seconds):
         raise SolverError(
             f"a fit of {fit.poles.omega.size} modes takes some {fit.seconds:.1g} s to set up: too little time, "

@@ -16,6 +16,7 @@ import numpy as np
 from sysid.errors import InputError, finite_array, instance, refuse, shown, text, whole_number
 from sysid.files.tree import to_bytes
 from sysid.finding import Finding
+from sysid.modal_analysis.response import residual_share
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
@@ -97,7 +98,7 @@ class Recipe:
 
         Such as "test.h5, lumped mass, 103 kg stated".
         """
-        asked = [] if self.modes is None else [f"{self.modes} modes"]
+        asked = [] if self.modes is None else [f"{self.modes} mode{'s' * (self.modes > 1)}"]
         asked += [f"on {', '.join(self.sensors)}"] * bool(self.sensors)
         if self.module == "recorded_test" and self.data:
             return ", ".join([Path(self.data).name, *starmap(_option_in_words, self.parameters.items()), *asked])
@@ -200,6 +201,14 @@ class Identification(Answer):
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
             "unknown_units": {v.name: v.unit for v in reported},
+            "band_hz": self.measurement.freq[[0, -1]].tolist(),
+            "degrees_of_freedom": list(self.degrees_of_freedom),
+            "residual_modes": {
+                "count": self.structure.residual.count,
+                "static": self.structure.residual.static,
+                "share_of_response": residual_share(self.measurement, self.structure),
+            },
+            "effective_mass_kg": np.einsum("kii->i", self.structure.effective_masses).tolist(),
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),

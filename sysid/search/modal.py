@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.modal_analysis.modal_estimate import residual_of
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles, within
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles, too_few, within
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
@@ -99,13 +99,10 @@ class Modal:
         mass, stated = problem.declared.mass, problem.frequencies.size
         formed = not mass.free or mass.entries is not None
         refuse(
-            (count > most, f"Modal: {count} modes are asked for, and these {lines.max()} lines hold {most} at most"),
-            (chosen.size > count, f"Modal: {chosen.size} sensors are named as degrees of freedom of {count} modes"),
-            (
-                stated not in (0, count),
-                f"Modal: {count} modes are asked for, and SpectralStiffness states {stated} frequencies",
-            ),
-            (formed and count != n, f"Modal: {count} modes are asked for; with this mass there are {n}, one a sensor"),
+            (count > most, f"Modal: modes={count}, and these {lines.max()} lines hold {most} at most"),
+            (chosen.size > count, f"Modal: modes={count}, and {chosen.size} sensors are named as degrees of freedom"),
+            (stated not in (0, count), f"Modal: modes={count}, and SpectralStiffness states {stated} frequencies"),
+            (formed and count != n, f"Modal: modes={count}; with this mass there are {n}, one a sensor"),
         )
 
     def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
@@ -229,7 +226,7 @@ def _left_out(problem: Prepared, structure: Structure, count: int | None) -> Ite
     others = found.omega[~within(found.omega, ends, ours) & (found.omega >= ends[0]) & (found.omega <= ends[1])]
     if others.size:
         which = ", ".join(f"{w / (2 * np.pi):.5g}" for w in others)
-        yield search_note(f"{count} modes are asked for: what stands out of the data at {which} Hz too is left out")
+        yield search_note(f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out")
 
 
 def _in_unknowns(
@@ -281,8 +278,8 @@ def modal_structure(
     end = held or end
     modes, residual = _in_band(problem, end)
     count = _modes_asked(problem, options)
-    if count not in (None, modes.omega.size):
-        raise DoesNotApplyError(f"{modes.omega.size} modes stand out of the noise, fewer than the {count} asked for")
+    if count is not None and count != modes.omega.size:
+        raise DoesNotApplyError(too_few(modes.omega.size, count))
     chosen = degrees_of_freedom(problem, modes, options.sensors)
     remainder = end.rigid - modes.gamma.T @ modes.gamma
     if test.force is None:
