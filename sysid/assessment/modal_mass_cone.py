@@ -80,9 +80,8 @@ def _in_band_in_words(test: Measurement, structure: Structure) -> str:
     sensors, beyond = int(np.count_nonzero(structure.dof_modes < 0)), structure.residual
     others = structure.n - sensors
     what = f"{structure.n} modes on {sensors} of {structure.n_sensors} sensors"
-    if others:
-        coordinates = "a modal coordinate" if others == 1 else f"{others} modal coordinates"
-        what += f" and {coordinates}, which the Craig-Bampton form (to_craig_bampton()) holds"
+    coordinates = f"{others} modal coordinate{'s' * (others > 1)}"
+    what += f" and {coordinates}, which the Craig-Bampton form (to_craig_bampton()) holds" * bool(others)
     if structure.n < structure.n_sensors:
         what += "; a mode that the base does not excite is not among them"
     if beyond.count:

@@ -128,7 +128,7 @@ def _add_run(command: Adder) -> None:
             "sysid run my_building.py --max-time 60 --quiet",
             "sysid run test.h5 --mass 1450",
             "sysid run test.h5 --band 0.5-20",
-            "sysid run test.h5 --modes 2 --dofs a1,a2",
+            "sysid run test.h5 --modes 1 --dofs top",
         ),
     )
     _add_problem(run, optional=True)

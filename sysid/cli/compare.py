@@ -31,11 +31,8 @@ def run(options: argparse.Namespace, out: Output) -> int:
     def tell(result: MethodResult) -> None:
         out.progress(f"{line(result)}\n")
 
-    modal = recipe.strategy(Modal.name)
-    compared = compare(
-        problem, rng=options.seed, max_time=options.max_time, modal=modal if isinstance(modal, Modal) else None,
-        listener=tell,
-    )  # fmt: skip
+    modal = Modal(recipe.sensors or None, modes=recipe.modes)
+    compared = compare(problem, rng=options.seed, max_time=options.max_time, modal=modal, listener=tell)
     if not compared.results:
         raise KeyboardInterrupt
     out.write(f"\n{comparison_text(compared)}\n\n")

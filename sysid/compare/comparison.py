@@ -21,6 +21,7 @@ from sysid.results.facts import seconds_in_words
 from sysid.results.summary import folded
 from sysid.results.tables import in_columns
 from sysid.search.auto import NAMED, check_strategy
+from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import DoesNotApplyError, Strategy
 from sysid.search.swarm import Swarm
@@ -81,7 +82,7 @@ def compare(
     *,
     rng: int = 0,
     max_time: float | None = None,
-    modal: Strategy | None = None,
+    modal: Modal | None = None,
     listener: Callable[[MethodResult], object] = lambda result: None,
 ) -> Comparison:
     """Run every strategy that applies, and the peers where the extra "benchmark" is installed.
@@ -97,7 +98,7 @@ def compare(
     max_time : float, optional
         s, of each method.
     modal : Modal, optional
-        The modal strategy, with the modes and sensors that are asked for.
+        With the modes and sensors that are asked for.
     listener : callable
         Called with each method's result when it has ended.
 
@@ -113,12 +114,11 @@ def compare(
     """
     loss = f"compare minimises squares, and the problem has loss={problem.loss!r}: leave it out"
     refuse((problem.loss != "squares", loss))
-    given = {} if modal is None else {modal.name: modal}
-    for strategy in given.values():
-        check_strategy(strategy, problem)
+    modal = modal or Modal()
+    check_strategy(modal, problem)
     results: list[MethodResult] = []
     try:
-        for result in _results(problem, rng, max_time, given):
+        for result in _results(problem, rng, max_time, modal):
             results.append(result)
             listener(result)
             if result.status is Status.INTERRUPTED:
@@ -128,13 +128,13 @@ def compare(
     return Comparison(problem, rng, max_time, tuple(results))
 
 
-def _results(problem: Problem, rng: int, max_time: float | None, given: dict[str, Strategy]) -> Iterator[MethodResult]:
-    """Run one method after the other, those that are given in the place of those of their names."""
+def _results(problem: Problem, rng: int, max_time: float | None, modal: Modal) -> Iterator[MethodResult]:
+    """Run one method after the other."""
     with one_thread(), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
         prepared = Prepared(problem)
         prepare(prepared, session)
-        strategies = {name: make() for name, make in NAMED.items()} | given
+        strategies = {name: make() for name, make in NAMED.items()} | {modal.name: modal}
         refusals = {name: strategy.refusal(prepared, None) for name, strategy in strategies.items()}
         reasons = "; ".join(f"{name}: {why}" for name, why in refusals.items())
         refuse((all(refusals.values()), f"no strategy applies: {reasons}"))

@@ -35,13 +35,13 @@ class Modes(NamedTuple):
         return Modes(self.phi[:, which], self.gamma[which], self.omega[which], self.ratios[which])
 
 
-def within(omega: Array, ends: Array, stated: Array | None = None, window: float = np.inf) -> NDArray[np.bool_]:
+def modes_within(omega: Array, ends: Array, stated: Array, window: float = np.inf) -> NDArray[np.bool_]:
     """True for modes within lines from `ends[0]` to `ends[1]`, all where there is none; or the nearest to stated ones.
 
-    Frequencies `omega` (m,), `ends` and `stated` are rad/s; a mode stands for one stated frequency, by which it is off
-    by `window` at most, relative.
+    Frequencies `omega` (m,), `ends` and `stated` (k,) are rad/s; a mode stands for one that is stated, from which it is
+    off by `window` at most, relative. Without any stated one lines count.
     """
-    if stated is None:
+    if not stated.size:
         inside = (omega >= ends[0]) & (omega <= ends[1])
         return inside if np.any(inside) else np.ones(omega.size, bool)
     apart = np.abs(np.log(omega / stated[:, None]))
@@ -53,7 +53,7 @@ def within(omega: Array, ends: Array, stated: Array | None = None, window: float
 
 def too_few(found: int, asked: int) -> str:
     """Why so many modes cannot be given, in words."""
-    there = "1 mode stands" if found == 1 else f"{found} modes stand"
+    there = f"{found} mode{'s' * int(found != 1)} stand{'s' * int(found == 1)}"
     return f"{there} out of the noise, fewer than the {asked} asked for"
 
 

@@ -27,7 +27,7 @@ _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 
 def fit_modes_of_lines(
     modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None = None,
-    inside: NDArray[np.bool_] | None = None, residual: bool = False, monitor: IterationMonitor, max_iterations: int,
+    inside: NDArray[np.bool_] | bool = True, residual: bool = False, monitor: IterationMonitor, max_iterations: int,
 ) -> ModalEstimate:  # fmt: skip
     """Fit modes at the poles of a test whose lines stand for themselves: its estimate with these, ascending.
 
@@ -42,7 +42,7 @@ def fit_modes_of_lines(
     count : int or None
         Of modes at the poles that are `inside`, one each at those whose loss the records would feel most, further ones
         where their residues need them; as many as the records need where None.
-    inside : (p,), optional
+    inside : (p,) or True
         Poles of the structure's modes; the others stand for modes beyond the lines, and are not counted.
     residual : bool
         Let modes stand for all that are above the lines where the records ask for it.
@@ -63,9 +63,8 @@ def fit_modes_of_lines(
         Where the time does not suffice.
     """
     fit = ModeFit(modal.records, poles, unit, monitor, max_iterations)
-    every = np.ones(poles.omega.size, bool)
     if count is not None:
-        fit, ours, counts = fit.at_strongest(count, every if inside is None else inside)
+        fit, ours, counts = fit.at_strongest(count, np.broadcast_to(inside, poles.omega.size))
         if counts[ours].sum() < count:
             return replace(modal, lacking=too_few(counts[ours].sum(), count))
     if not monitor.allows(fit.seconds):

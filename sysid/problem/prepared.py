@@ -18,7 +18,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import within
+from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
@@ -281,9 +281,9 @@ class Prepared(SearchSpace):
         """
         if not self.answers_in_band:
             return np.ones(omega.size, bool)
-        stated = self.formulation.stiffness.spectrum if self.stated.states_frequencies else None
+        ends, stated = 2 * np.pi * self.measurement.freq[[0, -1]], 2 * np.pi * self.stated.frequencies
         # A stated frequency may be off by the window, and a fit may move by it.
-        return within(omega, 2 * np.pi * self.measurement.freq[[0, -1]], stated, 2 * FREQUENCY_WINDOW)
+        return modes_within(omega, ends, stated, 2 * FREQUENCY_WINDOW)
 
     @cached_property
     def screened(self) -> Prepared:

@@ -201,14 +201,7 @@ class Identification(Answer):
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
             "unknown_units": {v.name: v.unit for v in reported},
-            "band_hz": self.measurement.freq[[0, -1]].tolist(),
-            "degrees_of_freedom": list(self.degrees_of_freedom),
-            "residual_modes": {
-                "count": self.structure.residual.count,
-                "static": self.structure.residual.static,
-                "share_of_response": residual_share(self.measurement, self.structure),
-            },
-            "effective_mass_kg": np.einsum("kii->i", self.structure.effective_masses).tolist(),
+            **self._in_band(),
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
@@ -235,6 +228,17 @@ class Identification(Answer):
             "refinement_statuses": dict(self.history.refinement_statuses),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,
+        }
+
+    def _in_band(self) -> dict[str, Any]:
+        """Content of the matrices: the band, their rows, effective masses, and residual modes."""
+        s, test = self.structure, self.measurement
+        share = residual_share(test, s)
+        return {
+            "band_hz": test.freq[[0, -1]].tolist(),
+            "degrees_of_freedom": list(self.degrees_of_freedom),
+            "effective_mass_kg": np.einsum("kii->i", s.effective_masses).tolist(),
+            "residual_modes": {"count": s.residual.count, "static": s.residual.static, "share_of_response": share},
         }
 
     def to_tree(self) -> dict[str, Any]:

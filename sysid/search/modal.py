@@ -8,7 +8,7 @@ are more modes than sensors, modal coordinates stand beside them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.modal_analysis.modal_estimate import residual_of
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles, too_few, within
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
@@ -101,7 +101,7 @@ class Modal:
         refuse(
             (count > most, f"Modal: modes={count}, and these {lines.max()} lines hold {most} at most"),
             (chosen.size > count, f"Modal: modes={count}, and {chosen.size} sensors are named as degrees of freedom"),
-            (stated not in (0, count), f"Modal: modes={count}, and SpectralStiffness states {stated} frequencies"),
+            (0 < stated < count, f"Modal: modes={count}, and SpectralStiffness states {stated} frequencies"),
             (formed and count != n, f"Modal: modes={count}; with this mass there are {n}, one a sensor"),
         )
 
@@ -193,7 +193,7 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     message += "; the fit of whole records did not settle: modes or noise still moved" * unsettled
     message += "; the time was over before every further fit was tried" * late
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
-    notes = tuple(_left_out(problem, structure, count))
+    notes = _left_out(problem, structure, count)
     if structure.at_sensors:
         structure, answer = _in_unknowns(problem, structure, answer, monitor, session)
     elif problem.formulation.mass.free:
@@ -217,16 +217,16 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     return Outcome(structure, x, options.name, success, message, history, stopped, findings=notes)
 
 
-def _left_out(problem: Prepared, structure: Structure, count: int | None) -> Iterator[Finding]:
+def _left_out(problem: Prepared, structure: Structure, count: int | None) -> tuple[Finding, ...]:
     """Poles within the lines that are none of the modes that were asked for."""
     found = problem.geometry.found
     if count is None or found is None:
-        return
-    ours, ends = 2 * np.pi * structure.natural_frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
-    others = found.omega[~within(found.omega, ends, ours) & (found.omega >= ends[0]) & (found.omega <= ends[1])]
-    if others.size:
-        which = ", ".join(f"{w / (2 * np.pi):.5g}" for w in others)
-        yield search_note(f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out")
+        return ()
+    ours, (first, last) = 2 * np.pi * structure.natural_frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
+    others = found.omega[~modes_within(found.omega, ours, ours) & (found.omega >= first) & (found.omega <= last)]
+    which = ", ".join(f"{w / (2 * np.pi):.5g}" for w in others)
+    sentence = f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out"
+    return (search_note(sentence),) * bool(which)
 
 
 def _in_unknowns(

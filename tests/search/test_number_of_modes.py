@@ -10,7 +10,7 @@ import pytest
 
 import sysid
 from sysid.modal_analysis.fit import estimate
-from sysid.modal_analysis.modal_fit import within
+from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.structure.structure import Structure
 
@@ -196,9 +196,10 @@ def test_a_result_of_fewer_modes_is_the_same_when_it_is_loaded(test, tmp_path):
 
 
 def test_modes_are_within_the_lines_or_nearest_to_what_is_stated():
+    none = np.zeros(0)
     omega, ends = np.array([1.0, 2.0, 2.1, 5.0]), (1.5, 3.0)
-    assert within(omega, ends).tolist() == [False, True, True, False]
-    assert within(np.array([4.0, 5.0]), ends).tolist() == [True, True]
-    assert within(omega, ends, np.array([2.1, 2.1])).tolist() == [False, True, True, False]
-    assert within(omega, ends, np.array([2.1, 2.1]), 0.01).tolist() == [False, False, True, False]
-    assert within(omega, ends, np.array([5.1]), 0.1).tolist() == [False, False, False, True]
+    assert modes_within(omega, ends, none).tolist() == [False, True, True, False]
+    assert modes_within(np.array([4.0, 5.0]), ends, none).tolist() == [True, True]
+    assert modes_within(omega, ends, np.array([2.1, 2.1])).tolist() == [False, True, True, False]
+    assert modes_within(omega, ends, np.array([2.1, 2.1]), 0.01).tolist() == [False, False, True, False]
+    assert modes_within(omega, ends, np.array([5.1]), 0.1).tolist() == [False, False, False, True]
