@@ -200,8 +200,8 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunReque
     given = (options.seed, options.strategy, options.refine_by, options.data, options.modes)
     more = any(one is not None for one in given) or bool(options.settings or options.dofs)
     if asked is None:
-        kept = f"--resume takes --seed, --strategy, --set and the like from the run in {folder}: {search}"
-        refuse((more, kept))
+        kept = "--seed, --strategy, --refine-by, --modes, --dofs, --data and --set"
+        refuse((more, f"--resume takes {kept} from the run in {folder}: {search}"))
         check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or is_test(options.problem), folder)
