@@ -82,7 +82,7 @@ def identify(
     """
     seed, random = seed_of(rng)
     instance("problem", problem, Problem)
-    check_strategy(strategy)
+    check_strategy(strategy, problem)
     if not isinstance(start, Structure | None):
         start = finite_array("start", start)
     max_time, max_evaluations = limits_of(max_time, max_evaluations)

@@ -20,7 +20,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.response import columns, gains
+from sysid.modal_analysis.response import columns, gains, residual_share
 from sysid.models.model import Geometry, Stated
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
@@ -79,15 +79,14 @@ def _in_band_in_words(test: Measurement, structure: Structure) -> str:
         return ""
     sensors, beyond = int(np.count_nonzero(structure.dof_modes < 0)), structure.residual
     others = structure.n - sensors
-    what = f"{structure.n} modes on {sensors} of {structure.n_sensors} sensors" + (
-        f" and {others} modal coordinates, which the Craig-Bampton form (to_craig_bampton()) holds" if others else ""
-    )
+    what = f"{structure.n} modes on {sensors} of {structure.n_sensors} sensors"
+    coordinates = f"{others} modal coordinate{'s' * (others > 1)}"
+    what += f" and {coordinates}, which the Craig-Bampton form (to_craig_bampton()) holds" * bool(others)
     if structure.n < structure.n_sensors:
         what += "; a mode that the base does not excite is not among them"
     if beyond.count:
-        added = np.einsum("sk,kdf,rdf->rsf", beyond.shapes, beyond.motion(test.freq), test.base)
-        share = np.linalg.norm(added) / np.linalg.norm(test.relative)
-        what += f"; modes beyond the lines add {100 * share:.2g} % of the response, and are kept as residual modes"
+        share = 100 * residual_share(test, structure)
+        what += f"; modes beyond the lines add {share:.2g} % of the response, and are kept as residual modes"
     return f"determined in {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz: {what}"
 
 

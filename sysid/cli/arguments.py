@@ -119,18 +119,21 @@ def _add_run(command: Adder) -> None:
     run = command(
         "run",
         summary="identify the structure of a problem",
-        description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5). "
-        "Writes result.h5, summary.json and report.html.",
+        description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5: "
+        "full mass, free stiffness and modal damping, of the modes within the lines). Writes result.h5, "
+        "summary.json and report.html.",
         examples=(
             "sysid run cantilever_tower",
             "sysid run cantilever_tower --set elements=3 --set noise=0.01 --out results/noisy",
             "sysid run my_building.py --max-time 60 --quiet",
             "sysid run test.h5 --mass 1450",
             "sysid run test.h5 --band 0.5-20",
+            "sysid run test.h5 --modes 1 --dofs top",
         ),
     )
     _add_problem(run, optional=True)
     _add_test_options(run)
+    _add_modal_options(run)
     run.add_argument(
         "--seed",
         type=_seed,
@@ -192,6 +195,19 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def _add_modal_options(command: argparse.ArgumentParser) -> None:
+    """Add what may be asked of the modal strategy."""
+    command.add_argument(
+        "--modes", type=_count, metavar="N",
+        help="so many modes within the lines, in place of all that stand out of the noise; residual modes, which stand "
+        "for what is beyond the lines, are not counted",
+    )  # fmt: skip
+    command.add_argument(
+        "--dofs", type=_names, metavar="NAME,...",
+        help="the sensors that M, K and C stand on, such as tip,panel: at most one a mode; chosen unless given",
+    )  # fmt: skip
+
+
 def _add_compare(command: Adder) -> None:
     compare = command(
         "compare",
@@ -202,6 +218,7 @@ def _add_compare(command: Adder) -> None:
         examples=("sysid compare shear_building --max-time 1 --out side_by_side",),
     )
     _add_problem(compare)
+    _add_modal_options(compare)
     compare.add_argument("--seed", type=_seed, default=0, metavar="N", help="of all methods, 0 by default")
     compare.add_argument(
         "--out",
@@ -358,6 +375,7 @@ def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) ->
         help="a path to a module (.py), else a module in ./problems, else a bundled problem, else a dotted module",
     )
     command.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
+    command.set_defaults(modes=None, dofs=())
     command.add_argument(
         "--set",
         action="append",
@@ -419,6 +437,14 @@ def _whole(least: int, text: str) -> int:
 
 
 _count, _seed = functools.partial(_whole, 1), functools.partial(_whole, 0)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Names of sensors."""
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of sensors: write their names with commas, as tip,panel")
+    return names
 
 
 def _seconds(text: str) -> float:

@@ -301,7 +301,8 @@ def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], 
     """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
     changes, kind = tuple(map(NumberOfModes, range(low, high + 1))), "identification{s}, each of so many modes"
     _check_possible(changes, problem)
-    found = poles_of(problem.prepared.screened).omega.size
+    prepared = problem.prepared.screened
+    found = int(np.count_nonzero(prepared.of_structure(poles_of(prepared).omega)))
     if low > found:
         raise InputError(f"{found} modes stand out of the noise, fewer than the {low} asked for")
     return changes[: found + 1 - low], kind if high <= found else f"{kind}: no more than {found} stand out of the noise"

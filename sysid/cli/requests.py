@@ -46,7 +46,8 @@ def recipe_of(options: argparse.Namespace, out: Output, rng: int | None = None) 
     data, seed = given.pop("data", options.data), _value(given.pop("rng", str(rng or 0)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise _mistake(module, f"rng = {seed!r} is not a nonnegative integer")
-    return Recipe(module, data, seed, {name: _value(text) for name, text in given.items()})
+    parameters = {name: _value(text) for name, text in given.items()}
+    return Recipe(module, data, seed, parameters, modes=options.modes, sensors=options.dofs)
 
 
 def _value(text: str) -> Any:
@@ -120,7 +121,7 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
         return given
     refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
     recorded_test.load(given.module)  # told before anything is made
-    return Recipe(_MODULE, given.module, given.rng, {**given.parameters, **extra})
+    return replace(given, module=_MODULE, data=given.module, parameters={**given.parameters, **extra})
 
 
 def folder_of(options: argparse.Namespace, out: Output) -> Path:
@@ -158,9 +159,9 @@ def resuming_command(search: RunRequest, folder: Path) -> str:
 
 
 def strategy_of(search: RunRequest) -> str | Strategy:
-    """The strategy of a search, with the eigenvalue refinement that was chosen; refused where it has none."""
+    """The strategy of a search, with the modes or the eigenvalue refinement that were asked for; or a refusal."""
     if search.refine_by is None:
-        return search.strategy
+        return search.recipe.strategy(search.strategy)
     chosen = NAMED[search.strategy]() if search.strategy in NAMED else None
     if not isinstance(chosen, Swarm):
         raise InputError(
@@ -196,11 +197,11 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunReque
     elsewhere = f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun"
     refuse((tree["begun"] is None, elsewhere))
     search = RunRequest.from_tree(tree["begun"])
-    given = (options.seed, options.strategy, options.refine_by, options.data)
-    more = any(one is not None for one in given) or bool(options.settings)
+    given = (options.seed, options.strategy, options.refine_by, options.data, options.modes)
+    more = any(one is not None for one in given) or bool(options.settings or options.dofs)
     if asked is None:
-        kept = f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
-        refuse((more, kept))
+        kept = "--seed, --strategy, --refine-by, --modes, --dofs, --data and --set"
+        refuse((more, f"--resume takes {kept} from the run in {folder}: {search}"))
         check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or is_test(options.problem), folder)

@@ -20,7 +20,8 @@ from sysid.problem.problem import Problem
 from sysid.results.facts import seconds_in_words
 from sysid.results.summary import folded
 from sysid.results.tables import in_columns
-from sysid.search.auto import NAMED
+from sysid.search.auto import NAMED, check_strategy
+from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import DoesNotApplyError, Strategy
 from sysid.search.swarm import Swarm
@@ -81,6 +82,7 @@ def compare(
     *,
     rng: int = 0,
     max_time: float | None = None,
+    modal: Modal | None = None,
     listener: Callable[[MethodResult], object] = lambda result: None,
 ) -> Comparison:
     """Run every strategy that applies, and the peers where the extra "benchmark" is installed.
@@ -95,6 +97,8 @@ def compare(
         Seed of each strategy, as of `identify`; a peer's is drawn from it.
     max_time : float, optional
         s, of each method.
+    modal : Modal, optional
+        With the modes and sensors that are asked for.
     listener : callable
         Called with each method's result when it has ended.
 
@@ -110,9 +114,11 @@ def compare(
     """
     loss = f"compare minimises squares, and the problem has loss={problem.loss!r}: leave it out"
     refuse((problem.loss != "squares", loss))
+    modal = modal or Modal()
+    check_strategy(modal, problem)
     results: list[MethodResult] = []
     try:
-        for result in _results(problem, rng, max_time):
+        for result in _results(problem, rng, max_time, modal):
             results.append(result)
             listener(result)
             if result.status is Status.INTERRUPTED:
@@ -122,13 +128,13 @@ def compare(
     return Comparison(problem, rng, max_time, tuple(results))
 
 
-def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[MethodResult]:
+def _results(problem: Problem, rng: int, max_time: float | None, modal: Modal) -> Iterator[MethodResult]:
     """Run one method after the other."""
     with one_thread(), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
         prepared = Prepared(problem)
         prepare(prepared, session)
-        strategies = {name: make() for name, make in NAMED.items()}
+        strategies = {name: make() for name, make in NAMED.items()} | {modal.name: modal}
         refusals = {name: strategy.refusal(prepared, None) for name, strategy in strategies.items()}
         reasons = "; ".join(f"{name}: {why}" for name, why in refusals.items())
         refuse((all(refusals.values()), f"no strategy applies: {reasons}"))

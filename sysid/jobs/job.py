@@ -22,7 +22,6 @@ from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
 from sysid.search.auto import robust_fit
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
-from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -126,8 +125,11 @@ def _identified(job: Job, session: Session) -> JobResult:
             changed, prepared, _descended(prepared, x, [], session), "from the result's unknowns", job.seed, session
         )
     else:
-        strategy = Modal(modes=job.change.count) if isinstance(job.change, NumberOfModes) else job.strategy
-        result = identify(changed, strategy=strategy, rng=job.seed)
+        there = changed.measurement.sensor_names
+        asked = replace(job.recipe, sensors=tuple(name for name in job.recipe.sensors if name in there))
+        if isinstance(job.change, NumberOfModes):
+            asked = replace(asked, modes=job.change.count)
+        result = identify(changed, strategy=asked.strategy(job.strategy), rng=job.seed)
         if result.interrupted:
             raise KeyboardInterrupt
     score = scored(result, None if job.change is None else _predicted(problem, result, job.change))

@@ -256,7 +256,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         (index.gamma.start + order[:, None] * d + np.arange(d)).ravel(),
         index.log_omega.start + order, index.log_ratios.start + order, index.rigid,
     ])  # fmt: skip
-    return ModalEstimate(
+    found = ModalEstimate(
         fit.test, without_transients(fit),
         *modes.at(order), p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
@@ -264,3 +264,4 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
         record_fit=fit, static=fit.static,
     )  # fmt: skip
+    return found if fit.kept is None else found.at(fit.kept[order])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import casadi as ca
@@ -169,6 +169,20 @@ class ModalEstimate:
     def modes(self) -> Modes:
         """The likeliest modes."""
         return Modes(self.phi, self.gamma, self.omega, self.ratios)
+
+    def at(self, kept: NDArray[np.bool_]) -> ModalEstimate:
+        """The estimate of some of the modes, (m,), whatever the others are: those of whole records."""
+        n, d = self.records.rigid_body.shape
+        ours = np.concatenate([np.tile(kept, n), np.repeat(kept, d), kept, kept, np.ones(d * (d + 1) // 2, bool)])
+        A, B = self.information, self.scatter
+        size = np.sqrt(np.maximum(np.diag(A)[~ours], np.finfo(float).tiny))
+        inner = np.linalg.pinv(A[np.ix_(~ours, ~ours)] / np.outer(size, size), hermitian=True) / np.outer(size, size)
+        turn = np.eye(ours.size)[ours]
+        turn[:, ~ours] = -A[np.ix_(ours, ~ours)] @ inner
+        return replace(
+            self, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,
+            scatter=None if B is None else turn @ B @ turn.T, gain=replace(self.gain, moves=self.gain.moves[ours]),
+        )  # fmt: skip
 
 
 def residual_of(estimate: ModalEstimate, modes: Modes) -> float:

@@ -35,6 +35,28 @@ class Modes(NamedTuple):
         return Modes(self.phi[:, which], self.gamma[which], self.omega[which], self.ratios[which])
 
 
+def modes_within(omega: Array, ends: Array, stated: Array, window: float = np.inf) -> NDArray[np.bool_]:
+    """True for modes within lines from `ends[0]` to `ends[1]`, all where there is none; or the nearest to stated ones.
+
+    Frequencies `omega` (m,), `ends` and `stated` (k,) are rad/s; a mode stands for one that is stated, from which it is
+    off by `window` at most, relative. Without any stated one lines count.
+    """
+    if not stated.size:
+        inside = (omega >= ends[0]) & (omega <= ends[1])
+        return inside if np.any(inside) else np.ones(omega.size, bool)
+    apart = np.abs(np.log(omega / stated[:, None]))
+    rows, columns = scipy.optimize.linear_sum_assignment(apart)
+    near = np.zeros(omega.size, bool)
+    near[columns[apart[rows, columns] <= np.log1p(window)]] = True
+    return near
+
+
+def too_few(found: int, asked: int) -> str:
+    """Why so many modes cannot be given, in words."""
+    there = f"{found} mode{'s' * int(found != 1)} stand{'s' * int(found == 1)}"
+    return f"{there} out of the noise, fewer than the {asked} asked for"
+
+
 def separate_poles(modes: Modes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first mode of each pole, in ascending order of these modes, and the pole of each mode, (m,)."""
     _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)

@@ -26,6 +26,7 @@ from sysid.modal_analysis.record_fit import (
     TRIAL,
     RecordFit,
     half_inverse,
+    joint_worth,
     record_modes,
     refitted,
     unit_diagonal,
@@ -84,6 +85,20 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
     if not more.settled or more.likelihood - fit.likelihood < added * least:
         return None
     return None if np.any(no_modes(more)) or np.min(worth(more)) < least else more
+
+
+def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> RecordFit:
+    """The fit, of which modes within the lines are kept that are `ours` (m,), and so many of these at most.
+
+    Those whose loss the records would feel least go. They stay in the fit: noise of the base as large as missing modes
+    would explain the records, with modes that are far from any.
+    """
+    omega, rise = fit.parameters.modes.omega, joint_worth(fit)
+    first, last = 2 * np.pi * fit.test.freq[[0, -1]]
+    gone = (omega >= first) & (omega <= last) & ~ours
+    while np.count_nonzero(ours & ~gone) > count:
+        gone = min((gone | (np.arange(omega.size) == k) for k in np.flatnonzero(ours & ~gone)), key=rise)
+    return replace(fit, kept=~gone) if np.any(gone) else fit
 
 
 def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> RecordFit:

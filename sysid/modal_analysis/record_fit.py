@@ -67,6 +67,8 @@ class RecordFit:
         Whether the search for modes was stopped, and this is the best until then.
     static : int
         So many modes, the last, stand for all above the lines: see `ModalFit`.
+    kept : (m,) or None
+        Modes that the estimate has, where fewer were asked for than the records show.
     """
 
     test: Measurement
@@ -76,6 +78,7 @@ class RecordFit:
     settled: bool
     stopped: bool = False
     static: int = 0
+    kept: NDArray[np.bool_] | None = None
 
     @cached_property
     def model(self) -> RecordModel:
@@ -156,7 +159,7 @@ class RecordFit:
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
-            "varying": self.model.whole.varying,
+            "varying": self.model.whole.varying, "kept": self.kept,
         }  # fmt: skip
 
     @classmethod
@@ -171,7 +174,8 @@ class RecordFit:
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"])
-        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"])
+        kept = tree.get("kept")  # results of before hold none
+        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
         shapes: list[tuple[int, ...]] = [
@@ -179,6 +183,7 @@ class RecordFit:
             (test.n_runs, c, TRACES), (len(model.runs), c + model.d),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
+        sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))
         return fit
 

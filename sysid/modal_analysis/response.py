@@ -126,6 +126,13 @@ def error_of_accelerations(test: Measurement, structure: Structure) -> float:
     return float(np.linalg.norm(weight * columns(test.predict(structure) - test.relative))) / scale
 
 
+def residual_share(test: Measurement, structure: Structure) -> float:
+    """Share of the relative accelerations that the residual modes of a structure add, of all in the test."""
+    modes = structure.residual
+    added = np.einsum("sk,kdf,rdf->rsf", modes.shapes, modes.motion(test.freq), test.base)
+    return float(np.linalg.norm(added) / np.linalg.norm(test.relative))
+
+
 def records_of(test: Measurement) -> list[tuple[ComplexArray, Array | None]]:
     """The relative accelerations and, where it was measured, the base force, each with its stated deviations."""
     records = [(test.relative, test.response_std)]

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, weigh
+from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, too_few, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
 from sysid.modal_analysis.spectra_model import fit_spectra
@@ -26,8 +26,8 @@ _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 
 
 def fit_modes_of_lines(
-    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, residual: bool = False,
-    monitor: IterationMonitor, max_iterations: int,
+    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None = None,
+    inside: NDArray[np.bool_] | bool = True, residual: bool = False, monitor: IterationMonitor, max_iterations: int,
 ) -> ModalEstimate:  # fmt: skip
     """Fit modes at the poles of a test whose lines stand for themselves: its estimate with these, ascending.
 
@@ -40,9 +40,12 @@ def fit_modes_of_lines(
     unit : (d,)
         Size of participations, kg^½, m kg^½ for rotations.
     count : int or None
-        Of modes, one each at the poles whose loss the records would feel most; as many as the records need where None.
+        Of modes at the poles that are `inside`, one each at those whose loss the records would feel most, further ones
+        where their residues need them; as many as the records need where None.
+    inside : (p,) or True
+        Poles of the structure's modes; the others stand for modes beyond the lines, and are not counted.
     residual : bool
-        Beside as many as the records need, let modes stand for all that are above the lines where the records ask.
+        Let modes stand for all that are above the lines where the records ask for it.
     monitor : IterationMonitor
     max_iterations : int
         Of each fit.
@@ -55,12 +58,15 @@ def fit_modes_of_lines(
     Raises
     ------
     InputError
-        Where there are fewer than `count` poles, or the base force has the wrong sign.
+        Where the base force has the wrong sign.
     SolverError
         Where the time does not suffice.
     """
     fit = ModeFit(modal.records, poles, unit, monitor, max_iterations)
-    fit = fit if count is None else fit.at_strongest(count)
+    if count is not None:
+        fit, ours, counts = fit.at_strongest(count, np.broadcast_to(inside, poles.omega.size))
+        if counts[ours].sum() < count:
+            return replace(modal, lacking=too_few(counts[ours].sum(), count))
     if not monitor.allows(fit.seconds):
         raise SolverError(
             f"a fit of {fit.poles.omega.size} modes takes some {fit.seconds:.1g} s to set up: too little time, "
@@ -69,8 +75,8 @@ def fit_modes_of_lines(
     lacking = fit.lacking
     if lacking:
         return replace(modal, lacking=lacking)
-    found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
-    if residual and count is None:
+    found = fit.best() if count is None else fit.of_count(counts, ours)
+    if residual:
         found = fit.with_static(found)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
@@ -92,6 +98,8 @@ class ModeFit:
     max_iterations: int
     static: int = 0
     """So many modes, all at the last pole, which is held: see `ModalFit`."""
+    grows: bool = True
+    """Poles within the lines may go, or take further modes, as the records need; False where they are asked for."""
 
     @cached_property
     def records(self) -> Records:
@@ -105,8 +113,7 @@ class ModeFit:
         single = np.ones(m, dtype=int)
         best = self._grown(self.of_modes(single), single)
         # Modes of rank one may have dragged poles away from where several modes share one.
-        free = records.fit(poles.omega, poles.ratios)
-        noise = records.noise(free.left, free.residues.size)
+        free, noise = self._free_residues(poles.omega, poles.ratios)
         excess = best.of_accelerations**2 * records.size - free.squared_error
         ranks = free.ranks(noise, n, d)
         # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
@@ -131,40 +138,40 @@ class ModeFit:
         if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
-        first = separate_poles(best.modes)[0]
+        first, pole = separate_poles(best.modes)
         found, near = best.modes.omega[first], best.modes.omega[first] < times * last
         omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
+        counts = np.append(np.ones_like(first) if self.grows else np.bincount(pole), test.n_base)[np.append(near, True)]
         kept = self._worthwhile(omega, ratios)
-        omega, ratios = omega[kept], ratios[kept]
-        more = self._beside_static(omega, ratios)
+        omega, ratios, counts = omega[kept], ratios[kept], counts[kept]
+        more = self._beside_static(omega, ratios, counts)
         far = times * last * (1 + ROUND_OFF)
         stays = more.modes.omega[separate_poles(more.modes)[0]] < far
         if not np.all(stays):  # a pole that passes the static modes stands for what they do
-            omega, ratios = omega[stays], ratios[stays]
-            more = self._beside_static(omega, ratios)
+            omega, ratios, counts = omega[stays], ratios[stays], counts[stays]
+            more = self._beside_static(omega, ratios, counts)
         inside = np.count_nonzero(omega < last), np.count_nonzero(np.unique(more.modes.omega) < last)
         # One that comes into the lines is no mode.
         if more.status != "settled" or inside[0] != inside[1] or np.any(more.modes.omega > far):
             return best
         unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
         gained = (best.residual**2 - more.residual**2) * self.records.size
-        free = self.records.fit(omega, ratios)
-        noise = self.records.noise(free.left, free.residues.size)
+        noise = self._free_residues(omega, ratios)[1]
         return more if gained > np.sign(unknowns) * beyond_chance(max(abs(unknowns), 1)) * noise else best
 
-    def _beside_static(self, omega: Array, ratios: Array) -> ModalFit:
-        """Fit of modes at these poles, as many as base directions at the last, which is held."""
+    def _beside_static(self, omega: Array, ratios: Array, counts: Integers) -> ModalFit:
+        """Fit of so many modes at each of these poles, of which the last is held."""
         fit = replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=self.test.n_base)
-        counts = np.ones(omega.size, dtype=int)
-        counts[-1] = fit.static
-        return fit._grown(fit.of_modes(counts), counts)
+        found = fit.of_modes(counts)
+        return fit._grown(found, counts) if self.grows else found
 
     def _worthwhile(self, omega: Array, ratios: Array) -> Integers:
         """Poles that noise does not explain beside the last one: some stood for what that explains."""
         subsets, kept = SubsetFits(self.records, omega, ratios), np.arange(omega.size)
         while kept.size > 1:
             worth, _ = subsets.worth(kept)
-            least = int(np.argmin(worth[:-1]))
+            asked_for = not self.grows and omega[kept] <= 2 * np.pi * self.test.freq[-1]
+            least = int(np.argmin(np.where(asked_for, np.inf, worth)[:-1]))
             if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
                 break
             kept = np.delete(kept, least)
@@ -186,22 +193,44 @@ class ModeFit:
         noise = records.noise(free.left, free.residues.size)
         return bool(np.sum(along**2) > noise * beyond_chance(along.size))
 
-    def at_strongest(self, count: int) -> ModeFit:
-        """The same at so many poles: those whose loss the records would feel most.
+    def at_strongest(self, count: int, inside: NDArray[np.bool_]) -> tuple[ModeFit, NDArray[np.bool_], Integers]:
+        """The same at so many of the poles `inside`, those whose loss the records would feel most, and at all others.
 
-        Raises
-        ------
-        InputError
-            Where there are not so many poles.
+        Returns
+        -------
+        fit : ModeFit
+        inside : (p,)
+            Of its poles.
+        counts : (p,)
+            Modes at each: where there are fewer poles, further ones where residues need them, at most as many as these.
         """
-        poles = self.poles
-        if count > poles.omega.size:
-            raise InputError(f"{poles.omega.size} modes stand out of the noise, fewer than the {count} asked for")
-        subsets, kept = SubsetFits(self.records, poles.omega, poles.ratios), np.arange(poles.omega.size)
-        while kept.size > count:
+        subsets, kept = SubsetFits(self.records, self.poles.omega, self.poles.ratios), np.arange(inside.size)
+        while np.count_nonzero(inside[kept]) > count:
             worth, _ = subsets.worth(kept)
-            kept = np.delete(kept, np.argmin(worth))
-        return replace(self, poles=replace(poles, omega=poles.omega[kept], ratios=poles.ratios[kept]))
+            kept = np.delete(kept, np.argmin(np.where(inside[kept], worth, np.inf)))
+        fit, counts, inside = self._at(kept), np.ones(kept.size, dtype=int), inside[kept]
+        lacking = count - np.count_nonzero(inside)
+        if lacking > 0:
+            free, noise = fit._free_residues(fit.poles.omega, fit.poles.ratios)
+            s = np.linalg.svd(free.whitened.reshape(kept.size, -1, self.test.n_sensors), compute_uv=False)[:, 1:]
+            ranks = free.ranks(noise, *self.test.rigid_body.shape)
+            s[(np.arange(s.shape[1]) >= ranks[:, None] - 1) | ~inside[:, None]] = 0.0
+            strongest = np.argsort(-s, axis=None)[: min(lacking, np.count_nonzero(s))]
+            counts += np.bincount(strongest // max(s.shape[1], 1), minlength=kept.size)
+        return fit, inside, counts
+
+    def of_count(self, counts: Integers, inside: NDArray[np.bool_]) -> ModalFit:
+        """Fit of so many modes at each pole; of the poles that are not `inside` none may come into the lines."""
+        found = self.of_modes(counts)
+        first, last = 2 * np.pi * self.test.freq[[0, -1]]
+        omega = found.modes.omega[separate_poles(found.modes)[0]]
+        stays = inside | (omega < first) | (omega > last)
+        return found if np.all(stays) else self._at(np.flatnonzero(stays)).of_count(counts[stays], inside[stays])
+
+    def _at(self, kept: Integers) -> ModeFit:
+        """The same at some of the poles, which are asked for."""
+        poles = replace(self.poles, omega=self.poles.omega[kept], ratios=self.poles.ratios[kept])
+        return replace(self, poles=poles, grows=False)
 
     @property
     def lacking(self) -> str:
@@ -249,7 +278,11 @@ class ModeFit:
     def _free(self, end: ModalFit, multiplicity: Integers) -> tuple[ResidueFit, float]:
         """Free residues at a fit's poles, and the variance of a real number of the records about them."""
         first = np.cumsum(multiplicity) - multiplicity
-        free = self.records.fit(end.modes.omega[first], end.modes.ratios[first])
+        return self._free_residues(end.modes.omega[first], end.modes.ratios[first])
+
+    def _free_residues(self, omega: Array, ratios: Array) -> tuple[ResidueFit, float]:
+        """Free residues at poles, and the variance of a real number of the records about them."""
+        free = self.records.fit(omega, ratios)
         return free, self.records.noise(free.left, free.residues.size)
 
     def _lacking_rank(self, best: ModalFit, multiplicity: Integers) -> int | None:

@@ -39,10 +39,11 @@ class SpectralStiffness(FieldTree):
     ----------
     natural_frequencies : array_like, optional
         Hz, the measured ones in ascending order; repeated ones repeated. Without them a Problem finds
-        those that stand out of its measurement.
+        those that stand out of its measurement. With a full mass of any total the modal strategy answers with these
+        modes alone, and what stands for modes beyond the lines.
     max_frequency : float, optional
-        Hz, at or above the highest of *all* frequencies that the model has; the highest given
-        one by default, which supposes that all n are given.
+        Hz, of searches with as many modes as sensors: at or above the highest of *all* frequencies that the model has.
+        The highest given one by default, which supposes that all n are given; with fewer the last line.
 
     References
     ----------
@@ -92,13 +93,8 @@ class SpectralStiffness(FieldTree):
             return 2 * np.pi * float(self.max_frequency)
         if targets.size == n:
             return float(targets[-1])
-        if self.natural_frequencies is None:
-            # With fewer modes in the data than sensors nothing tells the model's other frequencies.
-            return float(max(2 * np.pi * geometry.test.freq[-1], targets[-1]))
-        raise InputError(
-            f"{targets.size} natural frequencies are given for {n} sensors: "
-            "state max_frequency (Hz), at or above the highest frequency of the whole model"
-        )
+        # With fewer modes than sensors nothing tells the model's other frequencies.
+        return float(max(2 * np.pi * geometry.test.freq[-1], targets[-1]))
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Entries of L_H, row by row, rad/s (eq. 37)."""

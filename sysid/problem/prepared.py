@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
@@ -18,12 +18,14 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.model_order import with_static_modes
+from sysid.modal_analysis.modal_fit import modes_within
+from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
+from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import Unknown
 from sysid.nlp import IterationMonitor, quiet_options
 from sysid.problem.formulation import Formulation
@@ -237,23 +239,28 @@ class Prepared(SearchSpace):
         See `fit_modes_of_lines`.
         """
         modal = fit_modes_of_lines(
-            self.modal[0], poles, np.sqrt(self.totals), count=count, residual=self.answers_in_band, monitor=monitor,
-            max_iterations=max_iterations,
+            self.modal[0], poles, np.sqrt(self.totals), count=count, inside=self.of_structure(poles.omega),
+            residual=self.answers_in_band, monitor=monitor, max_iterations=max_iterations,
         )  # fmt: skip
         self.modal = (modal, *self.modal[1:])
         return modal
 
-    def fit_static(self, monitor: FitMonitor) -> None:
-        """Let modes stand for all above the lines of the problem's own whole records, where these ask for it."""
+    def fit_records(self, count: int | None, monitor: FitMonitor) -> None:
+        """Finish the fit of the problem's own whole records: so many modes, where that is asked for.
+
+        Modes stand for all above the lines, where the answer is in the band and the records ask for it.
+        """
         fit = self.modal[0].record_fit
         if fit is None:
             return
         monitor.keep(fit)
         try:
             with monitor.at_work():
-                more = with_static_modes(fit, monitor=monitor)
+                more = with_static_modes(fit, monitor=monitor) if self.answers_in_band else fit
         except (Stop, KeyboardInterrupt):
             more = replace(fit, stopped=True)
+        if count is not None:
+            more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
             self.modal = (estimate(more), *self.modal[1:])
 
@@ -261,12 +268,22 @@ class Prepared(SearchSpace):
     def answers_in_band(self) -> bool:
         """True where modes beyond the lines are no modes of the structure.
 
-        Stated entries of the mass, stated frequencies, and a mass or stiffness of a form of its own are of as many
-        modes as degrees of freedom, wherever these are.
+        Stated entries of the mass, and a mass or stiffness of a form of its own are of as many modes as degrees of
+        freedom, wherever these are.
         """
         mass = self.formulation.mass
-        nothing_else = mass.free and mass.entries is None and not mass.weighs
-        return nothing_else and self.formulation.stiffness.free and not self.stated.states_frequencies
+        return mass.free and mass.entries is None and not mass.weighs and self.formulation.stiffness.free
+
+    def of_structure(self, omega: Array) -> NDArray[np.bool_]:
+        """True for modes of the structure, by their frequencies, rad/s, (m,): see `answers_in_band`.
+
+        They are those within the lines, or those that stand for stated frequencies.
+        """
+        if not self.answers_in_band:
+            return np.ones(omega.size, bool)
+        ends, stated = 2 * np.pi * self.measurement.freq[[0, -1]], 2 * np.pi * self.stated.frequencies
+        # A stated frequency may be off by the window, and a fit may move by it.
+        return modes_within(omega, ends, stated, 2 * FREQUENCY_WINDOW)
 
     @cached_property
     def screened(self) -> Prepared:

@@ -22,6 +22,9 @@ from sysid.structure.structure import Array, Structure
 class Problem(StatedProblem, SearchSpace):
     """A problem of identification: a measurement, and what is stated of the structure.
 
+    The measurement alone states nothing: as ``sysid run test.h5``, its answer is of the modes within the lines, and
+    without a measured base force their modal masses stay open, in units of 1 kg of rigid-body mass a direction.
+
     The constructor checks types, shapes and what is written. Attributes that need the modes of the records find them
     when they are first asked for, once; an identification finds its own.
 
@@ -29,12 +32,13 @@ class Problem(StatedProblem, SearchSpace):
     ----------
     measurement : Measurement
     mass : FullMass, LumpedMass, KnownMass, MatrixModel, array_like or expression
-        An array is a known mass matrix. An expression is written in `Variable` s, (n, n) or with the base's rows last
-        (n + d, n + d).
+        A full mass of any total by default. An array is a known mass matrix. An expression is written in
+        `Variable` s, (n, n) or with the base's rows last (n + d, n + d).
     stiffness : SpectralStiffness, ChainStiffness, MatrixModel, array_like or expression
-        A matrix is (n, n) or (n + d, n + d).
+        Free by default. A matrix is (n, n) or (n + d, n + d).
     damping : ModalDamping, ProportionalDamping, MatrixModel, array_like or expression
-        (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency.
+        (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency, which
+        are free by default.
     residuals : sequence of FurtherTest, Prior or expressions
         Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
         explained: a further test (`sysid.FurtherTest`), or what is known to some accuracy (`sysid.Prior`). The rows of

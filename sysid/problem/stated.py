@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, as_float, choice, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.models.mass import FullMass
 from sysid.models.model import Geometry, MatrixModel
 from sysid.models.stiffness_and_damping import ModalDamping, SpectralStiffness
 from sysid.models.unknowns import Variable, user_site
@@ -21,7 +22,7 @@ from sysid.problem import stored
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, as_models, geometry_of
 from sysid.problem.terms import FurtherTest
-from sysid.structure.structure import Structure
+from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,9 +33,9 @@ class StatedProblem:
     """
 
     measurement: Measurement
-    mass: Any = field(kw_only=True)
-    stiffness: Any = field(default_factory=SpectralStiffness, kw_only=True)
-    damping: Any = field(default_factory=ModalDamping, kw_only=True)
+    mass: Any = field(default=FullMass(healing="rigid_body"), kw_only=True)
+    stiffness: Any = field(default=SpectralStiffness(), kw_only=True)
+    damping: Any = field(default=ModalDamping(), kw_only=True)
     residuals: Sequence[Any] = field(default=(), kw_only=True)
     constraints: Sequence[Any] = field(default=(), kw_only=True)
     misfit: Any = field(default=None, kw_only=True)
@@ -135,9 +136,15 @@ class StatedProblem:
         return self.mass, self.stiffness, self.damping
 
     @property
+    def frequencies(self) -> Array:
+        """Natural frequencies that the stiffness states, Hz, so that none are looked for; (0,) where it states none."""
+        given = getattr(self.stiffness, "natural_frequencies", None)
+        return np.zeros(0) if given is None else np.atleast_1d(np.array(given, dtype=float))
+
+    @property
     def states_frequencies(self) -> bool:
-        """True where the stiffness states natural frequencies of its own, so that none are looked for."""
-        return getattr(self.stiffness, "natural_frequencies", None) is not None
+        """True where the stiffness states natural frequencies of its own."""
+        return self.frequencies.size > 0
 
     @cached_property
     def declared(self) -> Formulation:

@@ -16,6 +16,7 @@ import numpy as np
 from sysid.errors import InputError, finite_array, instance, refuse, shown, text, whole_number
 from sysid.files.tree import to_bytes
 from sysid.finding import Finding
+from sysid.modal_analysis.response import residual_share
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
@@ -26,6 +27,7 @@ from sysid.results.facts import PartOfProblem, StoredRecords
 from sysid.results.summary import summary
 from sysid.results.tables import gains_of_sensors, noise_of_channels
 from sysid.results.version import __version__
+from sysid.search.modal import Modal
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
@@ -51,6 +53,8 @@ class Recipe:
         of them.
     start : array_like (n_variables,), optional
         Unknowns where a refinement starts, such as the `x` of a result.
+    modes, sensors : int or None, tuple of str
+        Of `Modal`, by which the problem is identified; not passed to ``problem()``.
 
     Raises
     ------
@@ -63,6 +67,8 @@ class Recipe:
     rng: int = 0
     parameters: dict[str, Any] = field(default_factory=dict, compare=False)
     start: tuple[float, ...] | None = None
+    modes: int | None = None
+    sensors: tuple[str, ...] = ()
     # Recipes are compared by their parameters as texts: 1, 1.0 and True are equal in Python.
     _texts: frozenset[tuple[str, str]] = field(init=False, repr=False)
 
@@ -77,6 +83,9 @@ class Recipe:
         object.__setattr__(self, "_texts", frozenset((name, repr(value)) for name, value in self.parameters.items()))
         if self.start is not None:
             object.__setattr__(self, "start", tuple(finite_array("Recipe: start", self.start).ravel().tolist()))
+        if self.modes is not None:
+            object.__setattr__(self, "modes", whole_number("Recipe: modes", self.modes, at_least=1))
+        object.__setattr__(self, "sensors", tuple(text("Recipe: a sensor", one) for one in self.sensors))
         for name, value in self.parameters.items():
             refuse(
                 (name in ("data", "rng"), f"parameter {name!r} is a field of the recipe itself"),
@@ -89,17 +98,29 @@ class Recipe:
 
         Such as "test.h5, lumped mass, 103 kg stated".
         """
+        asked = [] if self.modes is None else [f"{self.modes} mode{'s' * (self.modes > 1)}"]
+        asked += [f"on {', '.join(self.sensors)}"] * bool(self.sensors)
         if self.module == "recorded_test" and self.data:
-            return ", ".join([Path(self.data).name, *starmap(_option_in_words, self.parameters.items())])
+            return ", ".join([Path(self.data).name, *starmap(_option_in_words, self.parameters.items()), *asked])
         given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
-        return f"{self.module} ({given})" if given else self.module
+        return ", ".join([f"{self.module} ({given})" if given else self.module, *asked])
+
+    def strategy(self, named: str) -> str | Modal:
+        """The strategy to identify the problem by: `named`, or the modal one with the modes and sensors asked for."""
+        if self.modes is None and not self.sensors:
+            return named
+        other = f"--modes and --dofs are of the strategy 'modal', and {named!r} is asked for: leave one of both out"
+        refuse((named not in ("auto", Modal.name), other))
+        return Modal(self.sensors or None, modes=self.modes)
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""
         parameters = {name: repr(value) for name, value in self.parameters.items()}
         # A number of any size, and values of any shape, as texts.
         tree = {"module": self.module, "data": self.data, "rng": str(self.rng), "parameters": parameters}
-        return tree if self.start is None else {**tree, "start": np.array(self.start)}
+        start = None if self.start is None else np.array(self.start)
+        more = {"start": start, "modes": self.modes, "sensors": list(self.sensors) or None}
+        return tree | {name: value for name, value in more.items() if value is not None}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Recipe:
@@ -111,7 +132,8 @@ class Recipe:
             Where a parameter is no plain value of Python's.
         """
         parameters = {name: _literal(name, text) for name, text in tree["parameters"].items()}
-        return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"))
+        asked = tree.get("modes"), tuple(tree.get("sensors", ()))
+        return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"), *asked)
 
 
 def _literal(name: str, text: Any) -> Any:
@@ -161,6 +183,7 @@ class Identification(Answer):
         return {
             "problem": self.recipe.module if self.recipe else None,
             "parameters": self.recipe.parameters if self.recipe else {},
+            "modes_asked": self.recipe.modes if self.recipe else None,
             "strategy": self.strategy,
             "seed": self.seed,
             "judgement": self.judgement,
@@ -178,6 +201,7 @@ class Identification(Answer):
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
             "unknown_units": {v.name: v.unit for v in reported},
+            **self._in_band(),
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
@@ -204,6 +228,17 @@ class Identification(Answer):
             "refinement_statuses": dict(self.history.refinement_statuses),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,
+        }
+
+    def _in_band(self) -> dict[str, Any]:
+        """Content of the matrices: the band, their rows, effective masses, and residual modes."""
+        s, test = self.structure, self.measurement
+        share = residual_share(test, s)
+        return {
+            "band_hz": test.freq[[0, -1]].tolist(),
+            "degrees_of_freedom": list(self.degrees_of_freedom),
+            "effective_mass_kg": np.einsum("kii->i", s.effective_masses).tolist(),
+            "residual_modes": {"count": s.residual.count, "static": s.residual.static, "share_of_response": share},
         }
 
     def to_tree(self) -> dict[str, Any]:

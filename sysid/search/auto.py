@@ -16,6 +16,7 @@ from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
+from sysid.problem.stated import StatedProblem
 from sysid.search.continuation import Continuation
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
@@ -35,19 +36,20 @@ NAMES = ", ".join(map(repr, ("auto", *NAMED)))
 Start = ArrayLike | Structure | None
 
 
-def check_strategy(strategy: str | Strategy) -> None:
-    """Refuse what is no strategy, before anything is looked for."""
+def check_strategy(strategy: str | Strategy, problem: StatedProblem) -> None:
+    """Refuse what is no strategy, or asks for modes or sensors that the problem's test cannot have, before any fit."""
     known, named = isinstance(strategy, Modal | Continuation | Swarm), isinstance(strategy, str)
     other = f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings"
     refuse(
         (not (known or named), other),
         (named and strategy not in ("auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
     )
+    if isinstance(strategy, Modal):
+        strategy.check(problem)
 
 
 def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[Strategy, str]:
     """The strategy that is taken, and why it is."""
-    check_strategy(strategy)
     if not isinstance(strategy, str):
         return strategy, f"{strategy.name!r}, as asked"
     if strategy in NAMED:

@@ -14,16 +14,13 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
-from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles
-from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
+from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
@@ -31,6 +28,8 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
+from sysid.problem.stated import StatedProblem
+from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom, sensors_by_name
 from sysid.search.local import LocalResult, solve
 from sysid.search.modal_program import (
     End,
@@ -47,7 +46,7 @@ from sysid.search.session import Session
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.superelement import ResidualModes
-from sysid.structure.thresholds import AS_GOOD, CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
+from sysid.structure.thresholds import AS_GOOD, EXACT
 
 Integers = NDArray[np.intp]
 
@@ -64,12 +63,12 @@ class Modal:
     sensors : sequence of str or int, optional
         Sensors (names, or numbers from 0) whose motions are the physical degrees of freedom where there are fewer modes
         than sensors, at most one a mode (modal coordinates make up the rest); chosen by a pivoted QR of the mode shapes
-        where none are given.
+        where none are given. Mass, stiffness and damping matrices stand on them.
     max_iterations : int
         Of IPOPT, in each fit.
     modes : int, optional
-        So many modes, each of a pole of its own: of those that stand out of the noise, the ones that the records need
-        most. All by default.
+        So many modes within the lines: of those that stand out of the noise, the ones that the records need most. What
+        stands for modes beyond the lines is not counted. All by default.
     """
 
     sensors: Sequence[str | int] | None = None
@@ -84,6 +83,27 @@ class Modal:
         for sensor in () if self.sensors is None else sequence("Modal: sensors", self.sensors, "a list of sensors"):
             if not isinstance(sensor, str):
                 whole_number("Modal: a sensor", sensor, at_least=0)
+
+    def check(self, problem: StatedProblem) -> None:
+        """Refuse what a test cannot have, before anything is fitted.
+
+        Sensors that are none of its, and other numbers of modes than its lines can hold or its model has.
+        """
+        test, count = problem.measurement, self.modes
+        chosen = sensors_by_name(test, self.sensors or ())
+        if count is None:
+            return
+        lines, (n, d) = np.count_nonzero(test.own_lines, axis=1), test.rigid_body.shape
+        # A mode has a shape, participations and a pole; each pole takes two lines.
+        most = int(min(2 * n * lines.sum() // (n + d + 1), (lines.max() - 1) // 2 * min(n, d)))
+        mass, stated = problem.declared.mass, problem.frequencies.size
+        formed = not mass.free or mass.entries is not None
+        refuse(
+            (count > most, f"Modal: modes={count}, and these {lines.max()} lines hold {most} at most"),
+            (chosen.size > count, f"Modal: modes={count}, and {chosen.size} sensors are named as degrees of freedom"),
+            (0 < stated < count, f"Modal: modes={count}, and SpectralStiffness states {stated} frequencies"),
+            (formed and count != n, f"Modal: modes={count}; with this mass there are {n}, one a sensor"),
+        )
 
     def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why poles and residues do not make the matrices, or a start that it would not read."""
@@ -107,80 +127,6 @@ class Modal:
                 f"{refusal}; 'auto' chooses another strategy"
             )
         return run_modal(problem, self, session)
-
-
-@dataclass(frozen=True, eq=False)
-class DegreesOfFreedom:
-    """Degrees of freedom of a modal model: sensors (k,), ascending, and modal coordinates (m - k,) beside them."""
-
-    sensors: Integers
-    modes: Integers
-
-    def coordinates(self, problem: Prepared, phi: Array) -> tuple[Array, Array, Array]:
-        """Inverse of the mode shapes at them, (m, m), their rigid motion, (m, d), and base direction, (m,), or -1."""
-        geometry, k = problem.geometry, self.modes.size
-        shapes = np.vstack([phi[self.sensors], np.eye(phi.shape[1])[self.modes]])
-        G = np.vstack([geometry.rigid_body[self.sensors], np.zeros((k, geometry.d))])
-        return np.linalg.inv(shapes), G, np.concatenate([geometry.directions[self.sensors], np.full(k, -1)])
-
-
-def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
-    """Sensors, and modal coordinates where they do not suffice, whose motions tell all modes' apart.
-
-    Sensors by a pivoted QR of the mode shapes, each mode in units of its own size, so that the chosen rows are
-    best conditioned. With more modes than independent sensors the modes that the sensors tell least become coordinates.
-    """
-    m = modes.omega.size
-    shapes = modes.phi / np.linalg.norm(modes.phi, axis=0)
-    rank = _independent_sensors(problem.measurement, modes)
-    if stated is not None:
-        sensors = _by_name(problem.measurement, stated)
-        if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < NEGLIGIBLE:
-            raise InputError(
-                f"{sensors.size} sensors are stated as degrees of freedom, but the {m} modes do not tell them apart "
-                f"(at most {rank} move independently)"
-            )
-    else:
-        sensors = np.sort(scipy.linalg.qr(shapes.T, pivoting=True, mode="r")[1][:rank])
-    order = scipy.linalg.qr(shapes[sensors], pivoting=True, mode="r")[1]
-    return DegreesOfFreedom(sensors, np.sort(order[sensors.size :]))
-
-
-def _independent_sensors(test: Measurement, modes: Modes) -> int:
-    """Number of combinations of sensors that move in the modes by more than noise would make of them.
-
-    Motions are judged, not shapes: two modes that nearly share a pole have shapes that are uncertain and nearly
-    parallel, while their sum and their difference in the records are well known. Of r combinations the sum of all
-    smaller singular values squared is (n - r) (m - r) numbers of noise, for n sensors and m modes.
-    """
-    n, m = modes.phi.shape
-    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
-    weight, size = weights_of(test.relative, test.response_std)
-    motion = np.einsum("nm,rmf->rnf", modes.phi, q)
-    error = weight * columns(test.relative - motion) / size
-    unknowns = modes.phi.size + modes.gamma.size + modes.omega.size
-    numbers = len(error) * int(np.count_nonzero(test.own_lines))
-    variance = float(np.sum(np.abs(error) ** 2)) / max(2 * numbers - unknowns, 1)
-    shared = line_correlation(error.reshape(len(error), -1, test.freq.size), unknowns)
-    variance = max(variance * shared, ROUND_OFF**2)
-    s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
-    beyond = np.cumsum(s[::-1] ** 2)[::-1]
-    chance = np.array([beyond_chance((n - r) * (m - r), CANDIDATES) for r in range(s.size)])
-    moving = 1 + np.max(np.flatnonzero(beyond > variance * chance), initial=-1)
-    shapes = np.linalg.svd(modes.phi / np.linalg.norm(modes.phi, axis=0), compute_uv=False)
-    return int(min(moving, np.count_nonzero(shapes > NEGLIGIBLE * shapes[0])))
-
-
-def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
-    names = test.sensor_names
-    chosen = []
-    for one in stated:
-        at = names.index(one) if one in names else one
-        if not isinstance(at, int | np.integer) or not 0 <= at < len(names):
-            raise InputError(f"Modal: {one!r} is no sensor; the sensors are {', '.join(names)}")
-        chosen.append(int(at))
-    refuse((len(set(chosen)) < len(chosen), "Modal: a sensor is named twice"))
-    return np.sort(np.array(chosen, dtype=int))
 
 
 def structure_of_modes(
@@ -220,9 +166,11 @@ def structure_of_modes(
 
 def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     """Modes from the data, and the structure that they make."""
-    if problem.answers_in_band and options.modes is None and problem.modal[0].by_modes:
+    count = _modes_asked(problem, options)
+    if problem.modal[0].by_modes and (count is not None or problem.answers_in_band):
+        poles_of(problem)  # a stated frequency that is none of the records' is told
         with session.fit_monitor() as watch:
-            problem.fit_static(watch)
+            problem.fit_records(count, watch)
         session.finish()
     monitor = IterationMonitor(session.reporter("local phase"), session.left)
     try:
@@ -245,11 +193,11 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     message += "; the fit of whole records did not settle: modes or noise still moved" * unsettled
     message += "; the time was over before every further fit was tried" * late
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
-    notes: tuple[Finding, ...] = ()
+    notes = _left_out(problem, structure, count)
     if structure.at_sensors:
         structure, answer = _in_unknowns(problem, structure, answer, monitor, session)
     elif problem.formulation.mass.free:
-        notes = (search_note(f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}"),)
+        notes += (search_note(f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}"),)
     else:
         plain = problem.measurement.sample_rate is not None
         raise DoesNotApplyError(
@@ -267,6 +215,18 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
             raise stopped
         success, message = False, str(stopped) or "interrupted"
     return Outcome(structure, x, options.name, success, message, history, stopped, findings=notes)
+
+
+def _left_out(problem: Prepared, structure: Structure, count: int | None) -> tuple[Finding, ...]:
+    """Poles within the lines that are none of the modes that were asked for."""
+    found = problem.geometry.found
+    if count is None or found is None:
+        return ()
+    ours, (first, last) = 2 * np.pi * structure.natural_frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
+    others = found.omega[~modes_within(found.omega, ours, ours) & (found.omega >= first) & (found.omega <= last)]
+    which = ", ".join(f"{w / (2 * np.pi):.5g}" for w in others)
+    sentence = f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out"
+    return (search_note(sentence),) * bool(which)
 
 
 def _in_unknowns(
@@ -317,6 +277,9 @@ def modal_structure(
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
     modes, residual = _in_band(problem, end)
+    count = _modes_asked(problem, options)
+    if count is not None and count != modes.omega.size:
+        raise DoesNotApplyError(too_few(modes.omega.size, count))
     chosen = degrees_of_freedom(problem, modes, options.sensors)
     remainder = end.rigid - modes.gamma.T @ modes.gamma
     if test.force is None:
@@ -338,32 +301,27 @@ def modal_structure(
 
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     """The modes of the structure, and those beyond the lines, which stand for all that are there."""
-    inside = _inside(problem, end.modes.omega)
+    inside = problem.of_structure(end.modes.omega)
     others = end.modes.at(~inside)
     residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, end.static)
     return end.modes.at(inside), residual
 
 
-def _inside(problem: Prepared, omega: Array) -> NDArray[np.bool_]:
-    """True for modes of the structure: those within the lines, or all where it has them wherever they are, (m,)."""
-    first, last = 2 * np.pi * problem.measurement.freq[[0, -1]]
-    inside = (omega >= first) & (omega <= last)
-    return inside if problem.answers_in_band and np.any(inside) else np.ones(omega.size, bool)
+def _modes_asked(problem: Prepared, options: Modal) -> int | None:
+    """Number of modes of the structure that is asked for, by itself or by stated frequencies; None where it is open."""
+    if options.modes is None and problem.answers_in_band and problem.stated.states_frequencies:
+        return problem.stated.frequencies.size
+    return options.modes
 
 
 def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
     """The modes of the records: fitted with the transients of whole ones, else to the lines, from poles close by."""
     modal = problem.modal[0]
     if not modal.by_modes:
-        modal = problem.fit_lines(poles, options.modes, monitor, options.max_iterations)
+        modal = problem.fit_lines(poles, _modes_asked(problem, options), monitor, options.max_iterations)
         if modal.fit is None:
             raise DoesNotApplyError(modal.lacking)
         return modal.fit
-    if options.modes not in (None, modal.omega.size):
-        raise InputError(
-            f"{modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "
-            "the band, or take estimator='h1'"
-        )
     residual = residual_of(modal, modal.modes)
     return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "", static=modal.static)
 
@@ -419,7 +377,7 @@ def _again(
     first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
     # Poles beyond the lines mean nothing by themselves, and several may be next to exchangeable.
-    held = ~_inside(problem, modes.omega[first])
+    held = ~problem.of_structure(modes.omega[first])
     found = solve_modes(
         problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
         unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
@@ -480,21 +438,31 @@ def held_by_model(problem: Prepared, structure: Structure) -> Array:
 
 
 def poles_of(problem: Prepared) -> Poles:
-    """Poles of the data; for stated frequencies theirs, with others looked for where the model is said to have more."""
+    """Poles of the data; for stated frequencies theirs, with those beyond the lines where the answer is in the band.
+
+    Others are looked for where a mass of a form of its own is said to have more.
+    """
     if problem.poles is not None:
         return problem.poles
-    stated, test = problem.formulation.stiffness.spectrum, problem.measurement
+    stated, test, in_band = problem.formulation.stiffness.spectrum, problem.measurement, problem.answers_in_band
     assert stated is not None
-    if stated.size == test.n_sensors:
+    try:
+        found = None if stated.size == test.n_sensors and not in_band else problem.geometry.poles
+    except InputError:  # too few lines to look for any
+        if not in_band:
+            raise
+        found = None
+    missed = [w for w in stated if found and np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)]
+    if found is None or (missed and in_band and not problem.modal[0].by_modes):
         try:
             return poles_near(test, stated, FREQUENCY_WINDOW)
         except InputError as error:
             raise DoesNotApplyError(str(error)) from error
-    found = problem.geometry.poles
-    missed = np.array([w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)])
-    if missed.size:
+    if missed:
         missing, others = (", ".join(f"{w / (2 * np.pi):.5g}" for w in omega) for omega in (missed, found.omega))
         raise DoesNotApplyError(
             f"of the stated natural frequencies {missing} Hz does not stand out of the data; found are {others} Hz"
         )
-    return found
+    first, last = 2 * np.pi * test.freq[[0, -1]]
+    kept = problem.of_structure(found.omega) | (found.omega < first) | (found.omega > last)
+    return Poles(found.omega[kept], found.ratios[kept], found.residual)

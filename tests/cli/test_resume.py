@@ -13,6 +13,8 @@ from sysid.results.checkpoint import FILE_NAME, Checkpoint
 
 RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
 
+KEPT = "--resume takes --seed, --strategy, --refine-by, --modes, --dofs, --data and --set from the run in out"
+
 
 @pytest.fixture
 def stopped(here, monkeypatch, no_pictures, capsys, commands):
@@ -156,8 +158,15 @@ def test_a_module_that_the_state_names_runs_where_the_user_names_or_trusts_it(st
     [
         (["--fresh"], "--resume and --fresh exclude each other"),
         (["--out", "x"], "--resume and --out exclude each other"),
-        (["--seed", "3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
-        (["--set", "n=3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
+        (
+            ["--seed", "3"],
+            KEPT,
+        ),
+        (["--modes", "2"], KEPT),
+        (
+            ["--set", "n=3"],
+            KEPT,
+        ),
     ],
 )
 def test_what_does_not_go_together_is_told(stopped, complaint, more, said):

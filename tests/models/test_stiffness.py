@@ -128,7 +128,6 @@ class TestSpectral:
             ("positive numbers", [[1.0, 2.0, 3.0]], None),
             ("ascending order", [2.0, 1, 3], None),
             ("4 natural frequencies are given for 3 sensors", [1.0, 2, 3, 4], None),
-            ("state max_frequency", [1.0, 2], None),
             ("max_frequency = 2.5 Hz is below the given natural frequency 3 Hz", [1.0, 2, 3], 2.5),
             ("max_frequency", [1.0, 2, 3], np.nan),
             ("max_frequency", [1.0, 2, 3], np.inf),
@@ -144,6 +143,10 @@ class TestSpectral:
     def test_fewer_frequencies_than_sensors_with_a_limit(self, geometry_of):
         (variable,) = SpectralStiffness([1.0, 2.0], max_frequency=9.0).unknowns(geometry_of(np.ones((3, 1))))
         np.testing.assert_allclose(variable.upper, 18 * np.pi)
+
+    def test_fewer_frequencies_than_sensors_are_searched_up_to_the_last_line(self, geometry_of):
+        geometry = geometry_of(np.ones((3, 1)))
+        assert SpectralStiffness([1.0, 2.0]).limit(geometry) == pytest.approx(2 * np.pi * geometry.test.freq[-1])
 
 
 class TestChain:

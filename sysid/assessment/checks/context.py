@@ -125,9 +125,9 @@ def _bounded(modal: ModalEstimate, std: Array, level: Array, left: ComplexArray,
 
 def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]:
     """Lines near a mode of a structure or of its records, (n_freq,)."""
-    test = modal.records
-    f = np.concatenate([structure.natural_frequencies, modal.omega / (2 * np.pi)])
-    ratio = np.concatenate([structure.damping_ratios, modal.ratios])
+    test, modes = modal.records, modal.modes if modal.record_fit is None else modal.record_fit.parameters.modes
+    f = np.concatenate([structure.natural_frequencies, modes.omega / (2 * np.pi)])
+    ratio = np.concatenate([structure.damping_ratios, modes.ratios])
     reach = np.maximum(2 * _NEAR * ratio * f, _NEAR * np.median(np.diff(test.freq))) if test.freq.size > 1 else np.inf
     return np.asarray(np.any(np.abs(test.freq - f[:, None]) < np.broadcast_to(reach, f.shape)[:, None], axis=0))
 

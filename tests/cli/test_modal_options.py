@@ -1,0 +1,122 @@
+"""``--modes`` and ``--dofs``: so many modes, on these sensors, of a run, of jobs about its result, and side by side."""
+
+import json
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.cli import main as cli
+from sysid.files.recorded_test import RecordedTest
+from sysid.results.checkpoint import RunRequest
+
+MASSES, SPRINGS = np.array([2.0, 3.0, 2.5]), np.array([3.0, 2.0, 1.5]) * 1e4
+NAMES = "low", "middle", "high"
+
+
+@pytest.fixture(scope="module")
+def truth():
+    K = np.diag(SPRINGS + np.append(SPRINGS[1:], 0)) - np.diag(SPRINGS[1:], 1) - np.diag(SPRINGS[1:], -1)
+    one = np.ones((3, 1))
+    full = np.block([[K, -K @ one], [-one.T @ K, one.T @ K @ one]])
+    return sysid.Structure(np.diag([*MASSES, 1.0]), full, [0.01, 0.012, 0.014], n_base=1)
+
+
+@pytest.fixture(scope="module")
+def file(truth, tmp_path_factory):
+    """Spectra up to between the second and the third mode."""
+    f = truth.natural_frequencies
+    test = sysid.simulate(truth, np.linspace(0.5 * f[0], (f[1] + f[2]) / 2, 150), noise=0.01, force=True, rng=0)
+    sensors = tuple(sysid.Sensor(name, (0, 0, float(i)), "x") for i, name in enumerate(NAMES))
+    run = test.base[0], test.response[0], test.force[0]
+    path = tmp_path_factory.mktemp("test") / "test.h5"
+    path.write_bytes(RecordedTest((run,), sensors, ("x",), (0.0, 0.0, 0.0), None, test.freq, ()).to_bytes())
+    return str(path)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, no_pictures):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def summary(folder):
+    return json.loads((folder / "out" / "summary.json").read_text())
+
+
+def test_the_matrices_stand_on_the_sensors_that_are_named(folder, file, truth):
+    assert cli.main(["run", file, "--modes", "2", "--dofs", "high,low", "--out", "out", "--quiet"]) == 0
+    told = summary(folder)
+    assert told["modes_asked"] == 2 and told["judgement"] == "determined"
+    assert told["degrees_of_freedom"] == ["low", "high"]
+    np.testing.assert_allclose(told["natural_frequencies_hz"], truth.natural_frequencies[:2], rtol=1e-3)
+    residual = told["residual_modes"]
+    assert residual["count"] >= residual["static"] and 0 < residual["share_of_response"] < 0.5
+    f = truth.natural_frequencies
+    assert told["band_hz"] == pytest.approx([0.5 * f[0], (f[1] + f[2]) / 2])
+    effective = truth.participation[:2, 0] ** 2
+    assert told["effective_mass_kg"] == pytest.approx([effective.sum()], rel=0.01)
+    assert told["effective_mass_kg"][0] < told["total_mass_kg"][0]
+    result = sysid.load(folder / "out")
+    assert (result.recipe.modes, result.recipe.sensors) == (2, ("high", "low"))
+    M = np.linalg.inv(truth.normal_modes[[0, 2], :2])
+    np.testing.assert_allclose(result.structure.mass[:2, :2], M.T @ M, rtol=0.02)
+
+
+def test_fewer_modes_than_the_lines_hold_are_obeyed_and_kept_by_jobs(folder, file, capsys):
+    cli.main(["run", file, "--modes", "1", "--out", "out", "--quiet"])
+    assert summary(folder)["modes_asked"] == 1 and len(summary(folder)["natural_frequencies_hz"]) == 1
+    capsys.readouterr()
+    assert cli.main(["refine", "out", "--bands", "5-15", "--workers", "1", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["identifications"]
+    assert [row["score"]["modes"] for row in rows] == [1, 1]
+    assert rows[0]["title"] == "test.h5, 1 mode"
+
+
+def test_numbers_of_modes_are_compared_up_to_those_within_the_lines(folder, file, capsys):
+    cli.main(["run", file, "--out", "out", "--quiet"])
+    capsys.readouterr()
+    assert cli.main(["refine", "out", "--orders", "1-5", "--workers", "1", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["identifications"]
+    assert [row["score"]["modes"] for row in rows] == [2, 1, 2]
+    assert [row["success"] for row in rows][::2] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--modes", "3"], "2 modes stand out of the noise, fewer than the 3 asked for"),
+        (["--modes", "none"], "'none' is not a whole number from 1"),
+        (["--modes", "900"], "modes=900, and these 150 lines hold 74 at most"),
+        (["--dofs", "low,top"], "'top' is no sensor; the sensors are low, middle, high"),
+        (["--dofs", "low,low"], "named twice"),
+        (["--dofs", "low,,high"], "is no list of sensors"),
+        (["--modes", "1", "--dofs", "low,high"], "modes=1, and 2 sensors are named"),
+        (["--modes", "2", "--strategy", "swarm"], "of the strategy 'modal', and 'swarm' is asked for"),
+        (["--modes", "2", "--lumped", "--mass", "7.5"], "modes=2; with this mass there are 3"),
+    ],
+)
+def test_a_mistake_is_one_line_with_status_2(folder, file, beside_progress, arguments, told):
+    assert cli.main(["run", file, *arguments, "--out", "out", "--quiet"]) == 2
+    line = beside_progress()[1].strip()
+    assert told in line and "\n" not in line
+    assert not (folder / "out" / "result.h5").exists()
+
+
+def test_methods_side_by_side_ask_the_modal_one_for_so_many(folder, file, capsys):
+    common = ["recorded_test", "--data", file, "--max-time", "0.3", "--json"]
+    assert cli.main(["compare", *common, "--dofs", "top"]) == 2
+    capsys.readouterr()
+    cli.main(["compare", *common, "--modes", "1"])
+    methods = json.loads(capsys.readouterr().out)["comparison"]["methods"]
+    (modal,) = [one for one in methods if one["method"] == "modal"]
+    assert modal["residual"] > 0.05  # of 1 % noise
+
+
+def test_an_unfinished_search_is_of_so_many_modes():
+    recipe = sysid.Recipe("recorded_test", "test.h5", modes=3, sensors=("a", "b"))
+    search = RunRequest(recipe, "auto", 0)
+    assert RunRequest.from_tree(search.to_tree()) == search
+    assert search != RunRequest(sysid.Recipe("recorded_test", "test.h5"), "auto", 0)
+    assert recipe.strategy("auto") == sysid.Modal(("a", "b"), modes=3)
+    assert recipe.title == "test.h5, 3 modes, on a, b"
