@@ -324,8 +324,9 @@ def modal_structure(
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
         residual = residual.without_mass(problem.totals)  # nothing weighs them
-    # A stated total is kept, even where the base force weighs another.
-    unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
+    # A stated total is kept, even where the base force weighs another; but of modes below the lines it weighs nothing.
+    weighs = end.modes.omega.min() >= 2 * np.pi * test.freq[0]
+    unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later and weighs))
     try:
         structure = structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet, residual=residual)
         return structure, end, chosen, poles
