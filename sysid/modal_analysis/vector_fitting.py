@@ -310,7 +310,8 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     lines, left = 2 * np.pi * records.freq[records.freq > 0], np.abs(records.in_runs(without_velocity.left)) ** 2
-    most = lines[np.argmax(left.sum(axis=(0, 2))[-lines.size :])]
+    left = left.sum(axis=(0, 2))[-lines.size :]
+    most = lines[np.argmax(np.minimum(left[1:], left[:-1]))]  # one line alone is no mode
     between = np.append(np.geomspace(omega.min(), omega.max(), 4 * omega.size), most)
     at = np.concatenate([np.tile(omega, 4) * shift, between])
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
@@ -329,6 +330,8 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
+        if best == at.size - 1 and np.ptp([np.sum((w > lines[0]) & (w < lines[-1])) for w in (omega, more[0])]) == 0:
+            continue  # what is left lies beyond the lines
         if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
             return more
     return None
