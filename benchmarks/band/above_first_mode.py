@@ -20,16 +20,16 @@ from benchmarks.band.structures import APART, END, Continuous, structure
 from benchmarks.line import Line, below
 
 TESTS, PATIENCE = 20, 120  # s of processor time each
-SHORT, SHORT_PATIENCE = (1, 4, 7, 10, 13), 20  # numbers that take few seconds
+SHORT, SHORT_PATIENCE = (7, 13), 20  # numbers that take few seconds
 BELOW = (1, 2)  # modes below the lines
 LEAST = 2  # modes in them
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Twenty tests; or five."""
+    """Twenty tests; or two."""
     numbers = list(SHORT if reduced else islice((k for k in count() if cut(k)), TESTS))
     answers = figures_of_each("above_first_mode", numbers, SHORT_PATIENCE if reduced else PATIENCE)
-    found = {f"{structure(k).name}": it for k, it in zip(numbers, answers, strict=True)}
+    found = {structure(k).name: it for k, it in zip(numbers, answers, strict=True)}
     what = f"{len(found)} tests whose lines begin above the first or second mode: "
     for text, of in (
         ("without a result", {name: it["said"] for name, it in found.items() if "said" in it}),

@@ -13,7 +13,7 @@ from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import Continuous, structure
 from benchmarks.line import Line, above, below
 
-STRUCTURES, SHORT = 60, 6
+STRUCTURES, SHORT = 60, (1, 7, 10)  # numbers of three that take few seconds
 PATIENCE, SHORT_PATIENCE = 120, 15  # s of processor time a structure, after which it has no result
 KNOWN = 0.1  # of the root of two diagonal entries: deviations of M, where it must be determined
 SHARE_KNOWN = 0.75  # of all structures: 45 of 60
@@ -28,10 +28,10 @@ Case = tuple[Continuous, Bound, dict]
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """60 structures, one draw each; or 6, with little patience."""
-    count, patience = (SHORT, SHORT_PATIENCE) if reduced else (STRUCTURES, PATIENCE)
-    truths = [structure(number) for number in range(count)]
-    answers = figures_of_each("one_structure", range(count), patience)
+    """60 structures, one draw each; or three, with little patience."""
+    numbers = SHORT if reduced else range(STRUCTURES)
+    truths, count = [structure(number) for number in numbers], len(numbers)
+    answers = figures_of_each("one_structure", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     cases = [(truth, bound(truth, draw(truth)), it) for truth, it in zip(truths, answers, strict=True)]
     what = f"{count} continuous structures: "
     known = [case for case in cases if case[1].of_mass < KNOWN]

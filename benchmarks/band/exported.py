@@ -30,7 +30,7 @@ from benchmarks.line import Line, above, below
 from benchmarks.records.simulated import random_motion
 
 STRUCTURES, PATIENCE = 12, 120  # s of processor time each
-SHORT, SHORT_PATIENCE = (7, 10), 20  # numbers that take few seconds
+SHORT, SHORT_PATIENCE = (7,), 20  # one that takes few seconds
 BEYOND = 1.2  # of the last line, up to where files must answer as the structure does
 SAME, DIGITS, OF_TEXT = 1e-6, 1e-8, 1e-5  # base drive; entries of DMIG; universal files, of six digits
 IN_TIME, PERIODS, END = (
@@ -79,7 +79,7 @@ class Superelement(NamedTuple):
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Twelve structures; or two."""
+    """Twelve structures; or one."""
     numbers = list(SHORT if reduced else range(STRUCTURES))
     found = figures_of_each("exported", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     what = f"exported answers of {len(found)} continuous structures: "

@@ -303,16 +303,17 @@ def _settled(
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, between the poles, and where most is left, as of a
-    mode that was taken for poles of modes outside the lines. Damping that is not classical needs no pole: one more must
-    fit what the velocities of the poles cannot, or more than they all can.
+    Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
+    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
+    must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    lines, left = 2 * np.pi * records.freq[records.freq > 0], np.abs(records.in_runs(without_velocity.left)) ** 2
-    left = left.sum(axis=(0, 2))[-lines.size :]
-    most = lines[np.argmax(np.minimum(left[1:], left[:-1]))]  # one line alone is no mode
-    between = np.append(np.geomspace(omega.min(), omega.max(), 4 * omega.size), most)
+    between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    if omega.min() < lines[0]:
+        left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
+        between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
     at = np.concatenate([np.tile(omega, 4) * shift, between])
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
     plain = records.functions(at, loss)
@@ -330,8 +331,6 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        if best == at.size - 1 and np.ptp([np.sum((w > lines[0]) & (w < lines[-1])) for w in (omega, more[0])]) == 0:
-            continue  # what is left lies beyond the lines
         if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
             return more
     return None
