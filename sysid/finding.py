@@ -25,7 +25,7 @@ Kind = Literal[
     # What is to be known besides.
     "fixed", "strategy", "search", "ending", "on a bound", "search box", "assumed total", "level", "lines left out",
     "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio", "assumed gain",
-    "assumed force gain", "gain not shown", "noise not judged",
+    "assumed force gain", "gain not shown", "noise not judged", "modes below",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Judgement = Literal["determined", "one of many", "doubtful", "no fit"]

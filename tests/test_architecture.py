@@ -30,8 +30,9 @@ CEILINGS = {
     # and transients of runs eliminated run by run, noise levels and further modes of low rank (210),
     # and signs, gains and delays on settled poles, whose errors count (105),
     # and modes beyond the lines, which answer in the band and are none of the structure's (450),
-    # and so many modes, on such sensors, as are asked for (260).
-    "lines": 40_745,
+    # and so many modes, on such sensors, as are asked for (260),
+    # and lines that begin above the lowest mode, where nothing is judged by a constant (65).
+    "lines": 40_830,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

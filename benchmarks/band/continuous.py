@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from benchmarks.band.cramer_rao import Bound, bound
+from benchmarks.band.own_process import figures_of_each
 from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import Continuous, structure
 from benchmarks.line import Line, above, below
-from benchmarks.modal.spread import WORKERS
-from benchmarks.own_process import figures_of
 
-STRUCTURES, SHORT = 60, 6
+STRUCTURES, SHORT = 60, (1, 7, 10)  # numbers of three that take few seconds
 PATIENCE, SHORT_PATIENCE = 120, 15  # s of processor time a structure, after which it has no result
-SLOWER = 10  # by the clock, at most, on a machine with other work
 KNOWN = 0.1  # of the root of two diagonal entries: deviations of M, where it must be determined
 SHARE_KNOWN = 0.75  # of all structures: 45 of 60
 SHARE = 0.97
@@ -31,11 +28,10 @@ Case = tuple[Continuous, Bound, dict]
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """60 structures, one draw each; or 6, with little patience."""
-    count, patience = (SHORT, SHORT_PATIENCE) if reduced else (STRUCTURES, PATIENCE)
-    truths = [structure(number) for number in range(count)]
-    with ThreadPoolExecutor(WORKERS) as pool:
-        answers = list(pool.map(lambda number: _figures(number, patience), range(count)))
+    """60 structures, one draw each; or three, with little patience."""
+    numbers = SHORT if reduced else range(STRUCTURES)
+    truths, count = [structure(number) for number in numbers], len(numbers)
+    answers = figures_of_each("one_structure", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     cases = [(truth, bound(truth, draw(truth)), it) for truth, it in zip(truths, answers, strict=True)]
     what = f"{count} continuous structures: "
     known = [case for case in cases if case[1].of_mass < KNOWN]
@@ -52,13 +48,6 @@ def lines(reduced: bool) -> Iterator[Line]:
     slowest = max(cases, key=lambda case: case[2].get("seconds", 0.0))
     yield Line(what + f"seconds of processor time of the slowest with a result ({slowest[0].name})",
                f"{slowest[2].get('seconds', np.nan):.1f}")  # fmt: skip
-
-
-def _figures(number: int, patience: int) -> dict:
-    figures = figures_of("benchmarks.band.one_structure", [str(number), str(patience)], SLOWER * patience)
-    if figures.get("said") == "no output":  # as of a process that its system ended
-        return {"said": f"not done after {patience} s of processor time"}
-    return figures
 
 
 def _poles(what: str, cases: list[Case]) -> Line:

@@ -6,9 +6,6 @@ processor's time.
 
 from __future__ import annotations
 
-import json
-import resource
-import sys
 import time
 from dataclasses import asdict, dataclass
 
@@ -16,13 +13,14 @@ import numpy as np
 
 import sysid
 from benchmarks.band.cramer_rao import Bound, bound, in_band
+from benchmarks.band.own_process import answer
 from benchmarks.band.simulated_tests import Draw, draw, transfer
 from benchmarks.band.structures import Continuous, structure
 from benchmarks.mistakes.named_mistakes import MISTAKES
-from benchmarks.modal.identification import error_text
 from benchmarks.records.coupled_records import NEAR, matched
 
 LEVEL = 0.95
+OF_MASS = {"stated mass", "stated masses", "force misfit"}
 SYMMETRIC = ("effective_masses", "mass", "stiffness")
 
 
@@ -71,17 +69,23 @@ def compared(truth: Continuous, test: Draw, least: Bound) -> Figures:
     half_width = least.values["damping_ratios"] * f
     near = np.maximum(NEAR[0] * least.std["natural_frequencies"], NEAR[1] * half_width)
     pairs = matched(f, found.natural_frequencies[inside], near)
-    accused = [it for it in result.contradictions if it.channel is not None or it.kind in MISTAKES]
     first = next(
         (f"{it.kind}: {it.sentence}" for it in result.findings if it.severity in ("contradicts", "caution")), ""
     )
     all_there = len(pairs) == len(inside) == truth.count
     mine = inside[[j for _, j in pairs]] if all_there else inside[:0]
     return Figures(
-        result.determined, first, len(inside), len(pairs), [f"{it.kind}: {it.sentence}" for it in accused],
+        result.determined, first, len(inside), len(pairs), accusations(result),
         _ratios(found, least, mine) if all_there else {}, _held(result, least, mine) if all_there else {},
         _drive(found, truth, test), seconds,
     )  # fmt: skip
+
+
+def accusations(result: sysid.Identification) -> list[str]:
+    """Sentences that accuse a record, or a mass that is stated."""
+    kinds = MISTAKES | OF_MASS
+    accused = [it for it in result.contradictions if it.channel is not None or it.kind in kinds]
+    return [f"{it.kind}: {it.sentence}" for it in accused]
 
 
 def _ratios(found: sysid.Structure, least: Bound, mine: np.ndarray) -> dict[str, list[float]]:
@@ -131,19 +135,12 @@ def _drive(found: sysid.Structure, truth: Continuous, test: Draw) -> float:
     return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
 
-def main() -> None:
-    """Run one, and print its figures, those of the bound with them."""
-    number, seconds = (int(argument) for argument in sys.argv[1:])
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+def case(number: int) -> dict:
+    """Figures of one structure."""
     truth = structure(number)
     test = draw(truth)
-    least = bound(truth, test)
-    try:
-        figures = asdict(compared(truth, test, least))
-    except Exception as error:  # a crash is an answer too: the line counts it as not met
-        figures = {"said": error_text(error)}
-    print(json.dumps(figures))
+    return asdict(compared(truth, test, bound(truth, test)))
 
 
 if __name__ == "__main__":
-    main()
+    answer(case)

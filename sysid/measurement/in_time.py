@@ -16,6 +16,7 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE
 
 _LINES = 32  # in a part of a run whose noise is told, at least
+_NO_LINE = 0.1  # of the distance of lines, off which a frequency is none of them, however fine they are
 
 
 class RunInTime(NamedTuple):
@@ -114,9 +115,8 @@ def as_whole(test: Measurement) -> Measurement:
         return test
     freq = [test.freq[lines] for lines in lines_of_runs]
     spacing = np.array([float(np.min(np.diff(lines))) for lines in freq])
-    if any(
-        np.max(np.abs(f / df - np.round(f / df))) > NEGLIGIBLE * f[-1] / df for f, df in zip(freq, spacing, strict=True)
-    ):
+    at = [f / df for f, df in zip(freq, spacing, strict=True)]
+    if any(np.max(np.abs(k - np.round(k))) > min(NEGLIGIBLE * k[-1], _NO_LINE) for k in at):
         return test
     if test.sample_rate is None:
         # A period of the highest line, where the sample rate is not known.

@@ -110,13 +110,27 @@ def _find(records: Records, progress: _Progress) -> Poles:
     else:
         n = records.freq.size
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
-    lines = 2 * np.pi * records.freq
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    below = omega < lines[0]
+    if np.any(below):
+        below &= _of_one_sensor(records, omega, ratios)
+    if np.any(below):  # a sensor's wrong gain, no mode
+        omega, ratios = _settled(records, omega[~below], ratios[~below], progress)
     if not np.any((omega > (1 - BESIDE) * lines[0]) & (omega < (1 + BESIDE) * lines[-1])):
         raise InputError(
             "no mode stands out of the noise between these lines: state natural_frequencies or widen them, unless base "
             "and sensors are in different units (g and m/s²) or the spectra follow exp(-iwt) (take the conjugate)"
         )
     return _in_order(records, omega, ratios)
+
+
+def _of_one_sensor(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
+    """True for poles that one sensor alone shows beyond chance, (m,): far below the lines its gain does so, no mode."""
+    fit, n = records.fit(omega, ratios), records.n_sensors
+    worth = np.sum(fit.whitened.reshape(omega.size, -1, n) ** 2, axis=1)
+    others = np.sum(worth, axis=1) - np.max(worth, axis=1)
+    freedom = fit.residues[0].size * (n - 1) / n
+    return np.asarray(others < _noise(records, fit, omega.size) * beyond_chance(freedom, CANDIDATES)) & (n > 1)
 
 
 def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monitor | None = None) -> Poles:
@@ -290,16 +304,21 @@ def _settled(
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
-    needs no pole: one more must fit what the velocities of the poles cannot, or more than they all can.
+    Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
+    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
+    must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
+    without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    if omega.min() < lines[0]:
+        left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
+        between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
     at = np.concatenate([np.tile(omega, 4) * shift, between])
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
-    without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     least = _least_gain(without_velocity)
     tried = -1
     for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):

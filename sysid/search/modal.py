@@ -287,8 +287,9 @@ def modal_structure(
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
         residual = residual.without_mass(problem.totals)  # nothing weighs them
-    # A stated total is kept, even where the base force weighs another.
-    unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
+    # A stated total is kept, even where the base force weighs another, but not where it misses modes below the lines.
+    kept = mass.totals is not None and held is None and not later and end.modes.omega.min() >= 2 * np.pi * test.freq[0]
+    unmet = mass.free and (test.force is None or kept)
     try:
         structure = structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet, residual=residual)
         return structure, end, chosen, poles
@@ -392,8 +393,7 @@ def _free_spectrum(
     """Frequencies without bounds and damping ratios, of each pole that is not held; modes of one pole share them."""
 
     def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
-        # In units of the half-power half-width, which is what frequencies are known in.
-        # Cut off where no step of use leads.
+        # In units of the half-power half-width, by which frequencies are known; cut off where no step of use leads.
         room = np.where(held, 0.0, np.inf)
         shift = z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios)
         with np.errstate(divide="ignore"):

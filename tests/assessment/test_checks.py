@@ -157,6 +157,46 @@ def test_a_sensor_that_moves_with_the_base_beside_its_modes_is_told_by_how_much(
         assert (one.numbers["direction"], one.numbers["sensors"]) == (1, 1)
 
 
+class TestModesBelow:
+    """Lines begin above the first mode, which answers there like a constant."""
+
+    @staticmethod
+    def above_the_first(truth, **given):
+        f = truth.natural_frequencies
+        freq = np.geomspace(f[0] + 0.5 * (f[1] - f[0]), 1.3 * f[-1], 240)
+        return simulate(truth, freq, force=True, **given)
+
+    @pytest.mark.parametrize("total", [None, 13.0])
+    def test_neither_sensors_nor_a_stated_mass_are_judged_and_that_is_said(self, total):
+        truth = building()
+        test = self.above_the_first(truth, noise=0.003, rng=0)
+        result = sysid.identify(Problem(test, mass=FullMass(total, healing="rigid_body")), rng=0)
+        (told,) = result.of_kind("modes below")
+        assert told.severity == "note" and told.numbers["modes"] == 1
+        assert told.numbers["lowest"] == pytest.approx(truth.natural_frequencies[0], rel=0.05)
+        assert not result.contradictions and np.all(np.isnan(result.gains.error))
+        np.testing.assert_allclose(result.structure.natural_frequencies, truth.natural_frequencies[1:], rtol=1e-3)
+        force = result.structure.base_force(test.freq)
+        assert np.linalg.norm(force - truth.base_force(test.freq)) < 0.003 * np.linalg.norm(force)
+
+    def test_most_sensors_that_move_with_the_base_are_of_a_mode_without_a_pole(self):
+        """The answer knows nothing of the first mode, and no single sensor is named."""
+        truth = building()
+        test = self.above_the_first(truth)
+        P = np.linalg.inv(truth.mode_shapes)
+        K = (P.T * (2 * np.pi * np.array([1e4, *truth.natural_frequencies[1:]])) ** 2) @ P
+        full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=1)[None], K.sum(keepdims=True)]])
+        found = said(test, Structure(truth.mass, full, truth.damping_ratios, n_base=1))
+        told = [one for one in found if one.kind in ("modes below", "rigid motion")]
+        assert [(one.kind, one.channel, one.severity) for one in told] == [("modes below", None, "contradicts")]
+        assert told[0].numbers["sensors"] == 3
+
+    def test_nothing_is_said_where_the_lines_begin_below_all_modes(self):
+        truth = building()
+        result = sysid.identify(Problem(simulate(truth, lines(truth), noise=0.003, rng=0), mass=FullMass()), rng=0)
+        assert not result.of_kind("modes below")
+
+
 class TestTwins:
     @staticmethod
     def with_twin(sign, noise, *, apart=0.0):

@@ -11,7 +11,7 @@ from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
 from sysid.assessment.checks.context import BEYOND, misses_of, noise_at_most
 from sysid.assessment.checks.model_error import changing
-from sysid.measurement.in_time import cut_in_motion, peaks, quiet_levels, runs_in_time
+from sysid.measurement.in_time import as_whole, cut_in_motion, peaks, quiet_levels, runs_in_time
 
 
 def identified(test, **options):
@@ -130,3 +130,14 @@ def test_noise_is_told_by_its_quiet_lines_whatever_stands_out_of_the_others():
     # A quarter of 400 blocks: a quantile of the gamma law of 16, with a relative deviation of 1.7 % of its power, and
     # the louder fifth moves it up to where 31 % of the quiet ones lie, which is 4 % of the power.
     np.testing.assert_allclose(noise_at_most(test, left), 0.02, rtol=0.5 * (0.04 + 3 * 0.017))
+
+
+def test_spectra_at_uneven_lines_are_no_records_however_close_two_of_them_are():
+    """Stepped sines about a peak, two of them 1e-5 Hz apart, as multiples of which all lines are nearly any number."""
+    truth = sysid.Structure(np.diag([2.0, 0.0]), 3200.0 * np.array([[1, -1], [-1, 1]]), [0.01], n_base=1)
+    freq = np.unique([*np.geomspace(3.0, 12.0, 60), 6.3661977, 6.3662077])
+    base = np.random.default_rng(0).normal(size=(2, 1, freq.size)) + 0j
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(freq), base)
+    test = sysid.Measurement(freq, base, response, rigid_body=truth.rigid_body)
+    assert as_whole(test) is test
+    assert runs_in_time(test) == []

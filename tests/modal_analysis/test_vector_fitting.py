@@ -1,9 +1,13 @@
 """Poles from the data against structures whose poles are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import sysid
+from benchmarks.band import structures as continuous
+from benchmarks.band.simulated_tests import draw
 from sysid import InputError, Measurement, Problem, simulate
 from sysid.modal_analysis import vector_fitting
 from sysid.modal_analysis.complex_frequency import PolesAndResidues, noise_level
@@ -318,3 +322,30 @@ class TestMonitor:
         first = [i for i, _ in told].index(1)
         assert first >= 8
         assert told[-1][0] >= 10 - poles.omega.size
+
+
+def storeys():
+    """Three storeys, 4 kg and 5000 N/m each, 1 % damping, on a base of 1 kg."""
+    K = 5000.0 * np.array([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 1, 0], [-1, 0, 0, 1]])
+    return sysid.Structure(np.diag([4.0, 4.0, 4.0, 1.0]), K, [0.01, 0.01, 0.01], n_base=1)
+
+
+@pytest.mark.parametrize("error", [0.05, 0.2])
+def test_a_wrong_gain_of_one_sensor_makes_no_pole_below_the_lines(error):
+    """What it leaves is a constant, as a mode far below answers, but of one sensor alone."""
+    truth = storeys()
+    test = simulate(truth, lines(truth), noise=0.003, rng=0)
+    found = find_poles(replace(test, response=test.response * np.array([[1.0], [1.0 + error], [1.0]])))
+    assert np.all(found.omega > 2 * np.pi * test.freq[0])
+    f = found.omega / (2 * np.pi)
+    assert all(np.min(np.abs(f - one)) < 1e-3 * one for one in truth.natural_frequencies)
+
+
+def test_modes_below_the_lines_have_their_pole_and_cost_none_at_their_other_end():
+    """A plane frame whose lines begin above its first mode: its other modes are found, the last one weak."""
+    truth = continuous.structure(1)
+    f = truth.frequencies
+    cut = replace(truth, lines=(f[0] + 0.42 * (f[1] - f[0]), truth.lines[1]))
+    found = find_poles(draw(cut).measurement).omega / (2 * np.pi)
+    assert all(np.min(np.abs(found - one)) < 2e-3 * one for one in f[1:3])
+    assert np.any(found < cut.lines[0])

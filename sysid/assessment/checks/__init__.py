@@ -27,6 +27,7 @@ CHECKS: tuple[Check, ...] = (
     stated.on_a_bound,
     search_end.search_boxes,
     gains.assumed_totals,
+    gains.modes_below,
     model_error.other_levels,
     search_end.lines_left_out,
     model_error.noise_of_records,

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import Context, Ended, of_tests
-from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
+from sysid.assessment.checks.gains import (
+    MIMICKED,
+    NUMBERS_A_RESIDUE,
+    below_lines,
+    distinct_poles,
+    gain_errors,
+    wrong_gains,
+)
 from sysid.assessment.checks.stated import MISFIT, force_misfit, pressure_of
 from sysid.errors import InputError
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
@@ -28,6 +35,7 @@ from sysid.structure.thresholds import CANDIDATES, EXACT, FREE, MENDED, NEGLIGIB
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
+_FEW = 2  # sensors that may be wrong each by itself, where these are most of them
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 _SAME_SHAPE = 0.95  # modal assurance criterion
 _FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
@@ -60,7 +68,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
         return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
-    if not changing:
+    if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
     gains = [] if rigid or changing else list(wrong_gains(test, gain_errors(modal, structure)))
     found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
@@ -131,6 +139,16 @@ def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator
     moved /= np.where(reach > 0, reach, np.inf)
     most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
     wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base, CANDIDATES)) & (size > _GAIN))
+    for direction in np.unique(most[wrong]):
+        count, show = np.count_nonzero(most[wrong] == direction), np.count_nonzero(test.rigid_body[:, direction])
+        if count > _FEW and 2 * count > show:
+            yield Finding(
+                "modes below", Severity.CONTRADICTS,
+                f"{count} of {show} sensors move with base direction {direction + 1} beside their modes and what "
+                "rigid_body says: a mode below the lines that has no pole does so, or positions are wrong",
+                "let the lines begin below the lowest mode", numbers={"sensors": float(count)},
+            )  # fmt: skip
+            return
     for i in wrong[np.argsort(-size[wrong])][:MOST_OF_A_KIND]:
         yield Finding(
             "rigid motion", Severity.CONTRADICTS,

@@ -3,7 +3,7 @@ r"""Errors of single sensors' gains, as the constant term of the transmissibilit
 A sensor that reads ``1 + eps`` times its motion records ``(1 + eps) (G u + a)``. Its mode shapes take the factor, and
 its masses with them; ``eps G u`` is left beside all modes. Modes above the lines leave a part ``w² E u`` that grows
 with frequency, so that a constant is told apart. Modes below them answer by a constant too, and where one is fitted,
-nothing is told.
+nothing is told but that (`modes_below`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.context import Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -83,6 +83,10 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     share it are counted as such; noise that is stated larger counts as stated.
     """
     test, gain = modal.records, modal.gain
+    nothing = np.full(test.n_sensors, np.nan)
+    unknown = GainErrors(nothing, nothing, np.zeros(test.n_sensors), 1)
+    if below_lines(test, structure).size:
+        return unknown
     if modal.by_modes:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
@@ -90,8 +94,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (1 + velocity)
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 3 * test.n_base):
-        unknown = np.full(test.n_sensors, np.nan)
-        return GainErrors(unknown, unknown, np.zeros(test.n_sensors), 1)
+        return unknown
     free = records.fit(*poles, velocity=velocity)
     above = modes_above(test.freq, test.freq[-1])
     ones, rising = (records.basis(part + 0j) for part in (np.ones((1, test.freq.size)), above))
@@ -111,6 +114,29 @@ def _beyond(error: Array, std: Array) -> Array:
     """The part of errors with these deviations beyond chance, in 95 % of right tests none of any sensor."""
     likely = most_deviations(2 * error.size, 1 - COVERAGE)  # of two estimates each
     return np.sqrt(np.maximum(error**2 - (likely * std) ** 2, 0.0))
+
+
+def below_lines(test: Measurement, structure: Structure) -> Array:
+    """Frequencies of modes and residual modes below the lines, Hz, where they answer like a constant."""
+    f = np.append(structure.natural_frequencies, structure.residual.natural_frequencies)
+    return np.sort(f[f < test.freq[test.freq > 0][0]])
+
+
+def modes_below(context: Context) -> Iterator[Finding]:
+    """Modes lie below the lines, where signs, gains and the rigid-body mass cannot be told from what they add."""
+    if context.is_judged:
+        yield from of_tests([list(_below(modal.records, its)) for _, modal, its in context.fits])
+
+
+def _below(test: Measurement, structure: Structure) -> Iterator[Finding]:
+    f = below_lines(test, structure)
+    if f.size:
+        yield Finding(
+            "modes below", Severity.NOTE,
+            f"modes lie below the lines ({', '.join(f'{one:.4g}' for one in f)} Hz, by what they leave above): they "
+            "answer there like a constant, as signs, gains and the rigid-body mass do, which were not judged",
+            "let the lines begin below the lowest mode", numbers={"modes": float(f.size), "lowest": float(f[0])},
+        )  # fmt: skip
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.assessment.checks.context import Context, Ended
-from sysid.assessment.checks.gains import distinct_poles
+from sysid.assessment.checks.gains import below_lines, distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
 from sysid.errors import InputError, listed
 from sysid.files.units import POUND, STANDARD_GRAVITY
@@ -245,7 +245,8 @@ def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
     """The base force weighs another mass than the stated one."""
     test, stated = problem.measurement, problem.formulation.mass
     whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
-    if test.force is None or stated.weighs or not whole or not structure.modal_damping:
+    told = test.force is not None and not below_lines(test, structure).size
+    if not told or stated.weighs or not whole or not structure.modal_damping:
         return
     poles = distinct_poles(structure)
     weighed, expected = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
@@ -301,7 +302,7 @@ def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
 
 def force_misfit(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[Finding]:
     """The base force is not that of the modes that the accelerations show."""
-    if test.force is None:
+    if test.force is None or below_lines(test, structure).size:
         return
     entries, n = formulation.mass.entries, formulation.geometry.n
     # Masses are open, and none of them is below the sensors.
