@@ -380,12 +380,19 @@ def _may_be_modes(records: Records, omega: Array, ratios: Array) -> NDArray[np.b
     return inside & (broad | (omega > lines[-1]))
 
 
+def _lost(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
+    """Poles within the lines that can be no modes, (m,)."""
+    first, last = 2 * np.pi * records.freq[records.freq > 0][[0, -1]]
+    return (omega >= first) & (omega <= last) & ~_may_be_modes(records, omega, ratios)
+
+
 def _polish(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
     """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated.
 
-    It ends where a pole can be no mode any more, which is to go before the others are worth polishing.
+    It ends where a pole within the lines can be no mode any more: it is to go before the others are worth polishing.
+    From beyond the lines poles come back.
     """
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
@@ -406,7 +413,7 @@ def _polish(
         other = records.fit(*_poles(trial), velocity=velocity)
         if other.squared_error < error:
             p, fit, damping = trial, other, max(damping / 10, 1e-12)
-            if error - fit.squared_error < NEGLIGIBLE * error or not np.all(_may_be_modes(records, *_poles(p))):
+            if error - fit.squared_error < NEGLIGIBLE * error or np.any(_lost(records, *_poles(p))):
                 break
             H, slope = _projected(records, p, fit, velocity)
             failed = np.array(np.inf)

@@ -184,7 +184,7 @@ def test_poles_that_stood_for_modes_above_the_lines_go():
 def test_more_mass_than_is_spare_is_taken_off_static_modes_without_harm_to_the_accelerations():
     """Whole records of a plate, whose likeliest static modes would leave the base a negative mass."""
     truth = continuous_structure(41)
-    result = sysid.identify(sysid.Problem(draw(truth, 1).measurement, mass=sysid.FullMass()), rng=0)
+    result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
     modal, s = result.modal[0], result.structure
     weighs = modal.rigid - modal.gamma.T @ modal.gamma
     assert modal.static == 2 and np.linalg.eigvalsh(weighs)[0] < 0
