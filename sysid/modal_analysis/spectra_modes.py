@@ -15,7 +15,7 @@ from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separat
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
 from sysid.modal_analysis.spectra_model import fit_spectra
-from sysid.modal_analysis.vector_fitting import Poles
+from sysid.modal_analysis.vector_fitting import Poles, worthwhile
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, EXACT, ROUND_OFF, beyond_chance
@@ -99,7 +99,19 @@ class ModeFit:
         return Records(self.test)
 
     def best(self) -> ModalFit:
-        """The fit of as many modes as the records need."""
+        """The fit of as many modes as the records need.
+
+        Modes of rank one may have dragged a pole to where noise explains it: it is left out.
+        """
+        best = self._best_at_all()
+        omega, ratios = _poles_of(best)
+        kept = worthwhile(self.records, omega, ratios)
+        if not self._goes_on or best.of_accelerations <= EXACT or kept.size in (0, omega.size):
+            return best
+        return replace(self, poles=replace(self.poles, omega=omega[kept], ratios=ratios[kept])).best()
+
+    def _best_at_all(self) -> ModalFit:
+        """The fit of as many modes as the records need at all poles."""
         test, records, poles = self.test, self.records, self.poles
         m, n, d = poles.omega.size, test.n_sensors, test.n_base
         single = np.ones(m, dtype=int)
@@ -131,20 +143,19 @@ class ModeFit:
         if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
-        first = separate_poles(best.modes)[0]
-        found, near = best.modes.omega[first], best.modes.omega[first] < times * last
-        omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
-        kept = self._worthwhile(omega, ratios)
-        omega, ratios = omega[kept], ratios[kept]
-        more = self._beside_static(omega, ratios)
-        far = times * last * (1 + ROUND_OFF)
-        stays = more.modes.omega[separate_poles(more.modes)[0]] < far
-        if not np.all(stays):  # a pole that passes the static modes stands for what they do
+        omega, ratios = _poles_of(best)
+        near, far = omega < times * last, times * last * (1 + ROUND_OFF)
+        omega, ratios = np.append(omega[near], times * last), np.append(ratios[near], ratio)
+        while True:
+            kept = worthwhile(self.records, omega, ratios, held=1)
+            inside, more = np.count_nonzero(omega[kept] < last), self._beside_static(omega[kept], ratios[kept])
+            omega, ratios = _poles_of(more)
+            stays = omega < far  # a pole that passes the static modes stands for what they do
+            if np.all(stays) and worthwhile(self.records, omega, ratios, held=1).size == omega.size:
+                break
             omega, ratios = omega[stays], ratios[stays]
-            more = self._beside_static(omega, ratios)
-        inside = np.count_nonzero(omega < last), np.count_nonzero(np.unique(more.modes.omega) < last)
         # One that comes into the lines is no mode.
-        if more.status != "settled" or inside[0] != inside[1] or np.any(more.modes.omega > far):
+        if more.status != "settled" or np.count_nonzero(omega < last) > inside:
             return best
         unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
         gained = (best.residual**2 - more.residual**2) * self.records.size
@@ -159,26 +170,15 @@ class ModeFit:
         counts[-1] = fit.static
         return fit._grown(fit.of_modes(counts), counts)
 
-    def _worthwhile(self, omega: Array, ratios: Array) -> Integers:
-        """Poles that noise does not explain beside the last one: some stood for what that explains."""
-        subsets, kept = SubsetFits(self.records, omega, ratios), np.arange(omega.size)
-        while kept.size > 1:
-            worth, _ = subsets.worth(kept)
-            least = int(np.argmin(worth[:-1]))
-            if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
-                break
-            kept = np.delete(kept, least)
-        return kept
-
     def _misses_static(self, best: ModalFit) -> bool:
         """True where what free residues leave at the poles of a fit grows as w², beyond chance.
 
         Beside a constant, which a wrong gain makes.
         """
-        records, first = self.records, separate_poles(best.modes)[0]
+        records = self.records
         if best.of_accelerations <= EXACT:
             return False
-        free = records.fit(best.modes.omega[first], best.modes.ratios[first])
+        free = records.fit(*_poles_of(best))
         rise = modes_above(self.test.freq, self.test.freq[-1])[:1]
         beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
         rising = records.basis(rise + 0j)
@@ -284,3 +284,9 @@ class ModeFit:
         return fit_spectra(
             test, modes, rigid, static=self.static, monitor=self.monitor, max_iterations=self.max_iterations
         )  # fmt: skip
+
+
+def _poles_of(fit: ModalFit) -> tuple[Array, Array]:
+    """Circular frequencies and damping ratios of the poles of a fit, each once, in its order."""
+    modes = fit.modes.at(separate_poles(fit.modes)[0])
+    return modes.omega, modes.ratios

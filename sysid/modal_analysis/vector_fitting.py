@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -335,23 +336,35 @@ def _noise(records: Records, fit: ResidueFit, m: int) -> float:
 def _prune(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
-    """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
+    """Poles without those that do not earn their place."""
+    kept = worthwhile(records, omega, ratios, progress.step, velocity=velocity)
+    return omega[kept], ratios[kept]
+
+
+def worthwhile(
+    records: Records, omega: Array, ratios: Array, step: Callable[[float], object] = lambda _: None, *,
+    velocity: bool = False, held: int = 0,
+) -> NDArray[np.intp]:  # fmt: skip
+    """Numbers of the poles of which each lowers the squared error by far more than noise would, ascending.
+
+    The others are left out one by one, the least useful first, but for so many at the end that are `held`; `step` is
+    called with the squared error that those left give.
+    """
     lines = 2 * np.pi * records.freq[records.freq > 0]
     inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < DAMPED)
     inside &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))
     kept = np.flatnonzero(inside)  # what is no mode goes first, whatever it explains
-    subsets = None
-    while kept.size:
-        if subsets is None or 2 * kept.size < subsets.size:
-            omega, ratios, kept = omega[kept], ratios[kept], np.arange(kept.size)
-            subsets = SubsetFits(records, omega, ratios, velocity=velocity)
-        worth, squared_error = subsets.worth(kept)
-        progress.step(squared_error)
-        least = int(np.argmin(worth))
+    of, subsets = kept, None
+    while kept.size > held:
+        if subsets is None or 2 * kept.size < of.size:
+            of, subsets = kept, SubsetFits(records, omega[kept], ratios[kept], velocity=velocity)
+        worth, squared_error = subsets.worth(np.searchsorted(of, kept))
+        step(squared_error)
+        least = int(np.argmin(worth[: kept.size - held]))
         if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
             break
         kept = np.delete(kept, least)
-    return omega[kept], ratios[kept]
+    return kept
 
 
 def _polish(
