@@ -33,6 +33,7 @@ from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, ROUND_OFF, round_off
 
+_ROUND = 25  # steps in one form of the modes
 _SETTLED = EXACT**1.5  # of the sum of squares: a fall that is promised, at which the fit stands still
 
 
@@ -99,11 +100,22 @@ class SpectraModel(SpectralModel):
         self._at = np.concatenate([at, rigid])
         self._size = int(self._at.max()) + 1
         self._free, self._held = np.ones(self._size, bool), np.zeros(self._size)
+        self._largest: NDArray[np.intp] | None = None
 
-    def hold(self, gamma: Array, held: NDArray[np.bool_]) -> None:
-        """Leave some participations (m, d) as they are."""
+    def in_gauge(self, p: Parameters, unit: Array) -> Parameters:
+        """Parameters in the form of their modes that the unknowns keep from now on; `unit` (d,) of participations.
+
+        With a force the largest participation of each mode is by its logarithm, and the others are over it: a mode that
+        the force gives no mass, towards which shapes grow without end, turns nothing singular on the way.
+        """
+        gauge, held = held_gauge(p.modes, unit, self.force)
+        gamma = gauge * unit
         self._free[: gamma.size] = ~held.ravel()
-        self._held[: gamma.size] = gamma.ravel()
+        if self.force:
+            largest = np.arange(self.m) * self.d + np.argmax(np.abs(gauge), axis=1)
+            self._largest, self._sign = np.repeat(largest, self.d), np.sign(gamma.ravel()[largest])
+        self._held[: gamma.size] = self._in_units(gamma.ravel())
+        return self.with_best_shapes(p.modes._replace(gamma=gamma), p.rigid)
 
     def hold_last_pole(self, modes: Modes) -> None:
         """Leave the last pole as it is."""
@@ -117,12 +129,28 @@ class SpectraModel(SpectralModel):
         levels[:, self.n : self.channels] = np.inf
         return levels
 
+    def _in_units(self, gamma: Array) -> Array:
+        """Participations (m d,) as unknowns."""
+        if self._largest is None:
+            return gamma
+        sizes = gamma[self._largest]
+        own = self._largest == np.arange(gamma.size)
+        return np.where(own, np.log(np.abs(sizes)), gamma / sizes)
+
+    def _participations(self, unknowns: Array) -> Array:
+        """Participations (m, d) of their unknowns (m d,)."""
+        if self._largest is None:
+            return unknowns.reshape(self.m, -1)
+        sizes = self._sign * np.exp(np.clip(unknowns[self._largest[:: self.d]], -FAR, FAR))
+        own = self._largest == np.arange(unknowns.size)
+        return np.where(own, 1.0, unknowns).reshape(self.m, -1) * sizes[:, None]
+
     def pack(self, p: Parameters) -> Array:
         """The unknowns as one column, without the shapes."""
         modes = p.modes
         rigid = [p.rigid[i, j] for i, j in self.index.pairs] if self.force else []
         poles = np.log(modes.omega[self._first]), np.log(modes.ratios[self._first])
-        return np.concatenate([modes.gamma.ravel(), *poles, rigid])[self._free]
+        return np.concatenate([self._in_units(modes.gamma.ravel()), *poles, rigid])[self._free]
 
     def unpack(self, x: Array) -> Parameters:
         """Parameters with the best shapes."""
@@ -136,7 +164,9 @@ class SpectraModel(SpectralModel):
             rigid[i, j] = rigid[j, i] = value
         with np.errstate(over="ignore"):
             omega, ratios = np.exp(np.maximum(log_omega, -FAR)), np.exp(np.maximum(log_ratios, -FAR))
-        return self.with_best_shapes(Modes(np.zeros((self.n, self.m)), gamma.reshape(self.m, -1), omega, ratios), rigid)
+        return self.with_best_shapes(
+            Modes(np.zeros((self.n, self.m)), self._participations(gamma), omega, ratios), rigid
+        )
 
     def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:
         """Parameters with the shapes that leave least of the accelerations; those of `modes` are not read."""
@@ -163,12 +193,27 @@ class SpectraModel(SpectralModel):
         Of parameters with the best shapes. The Hessian is exact where it has no negative curvature, else Kaufman's.
         """
         plain, curved = self.slopes(p, levels)
-        joined = np.zeros((self._size, self._at.size))
-        joined[self._at, np.arange(self._at.size)] = 1.0
-        joined = joined[self._free]
-        exact = joined @ curved @ joined.T
-        normal = exact if _is_definite(exact) else joined @ plain.normal @ joined.T
+        joined, bend = self.chain(p.modes.gamma.ravel(), plain.gradient)
+        exact = joined @ curved @ joined.T + bend
+        normal = exact
+        if not _is_definite(exact):  # no step makes a participation smaller by much more than a factor e
+            normal = joined @ plain.normal @ joined.T + np.diag(np.maximum(np.diag(bend), 0.0))
         return NormalEquations(normal, joined @ plain.gradient, plain.chi2)
+
+    def chain(self, gamma: Array, gradient: Array) -> tuple[Array, Array]:
+        """Slopes of theta without the shapes by the unknowns, (unknowns, p), and what bends add to half the Hessian.
+
+        `gradient` is minus half that of the sum of squares by theta.
+        """
+        joined, bend = np.zeros((self._size, self._at.size)), np.zeros((self._size, self._size))
+        joined[self._at, np.arange(self._at.size)] = 1.0
+        if self._largest is not None:
+            at, largest = np.arange(gamma.size), self._largest
+            joined[at, at], joined[largest, at] = gamma[largest], gamma
+            along, across = gradient[: gamma.size] * gamma, gradient[: gamma.size] * gamma[largest]
+            bend[largest, at], bend[at, largest] = -across, -across
+            bend[largest, largest] = -np.add.reduceat(along, at[:: self.d]).repeat(self.d)
+        return joined[self._free], bend[np.ix_(self._free, self._free)]
 
     def slopes(self, p: Parameters, levels: Array) -> tuple[NormalEquations, Array]:
         """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes.
@@ -278,22 +323,24 @@ def fit_spectra(
     weights = weights_at(test, first.omega[poles], first.ratios[poles])
     model = SpectraModel(test, weights, pole)
     unit = np.sqrt(np.maximum(np.mean(first.gamma**2, axis=0), np.finfo(float).tiny))
-    gauge, held = held_gauge(first, unit, test.force is not None)
-    first = first._replace(gamma=gauge * unit)
-    model.hold(first.gamma, held)
     if static:
         model.hold_last_pole(first)
 
     def tell(_: int, p: Parameters, chi2: float) -> bool:
         return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)
 
-    problem = SumOfSquares(
-        model.pack(model.with_best_shapes(first, rigid)), model.unpack, lambda p: model.trial_chi2(p, model.levels),
-        lambda p: model.normal_equations(p, model.levels),
-    )  # fmt: skip
     # Far below the noise, so that IPOPT finds its tolerance met where it begins.
     enough = lambda chi2: _SETTLED * (chi2 + _SETTLED)  # noqa: E731
-    p, chi2, settled = minimise(problem, tell, max_iterations, enough)
+    p, settled = model.with_best_shapes(first, rigid), False
+    for _ in range(0, max_iterations, _ROUND):
+        p = model.in_gauge(p, unit)  # anew, as what was largest of modes at one pole may have become next to nothing
+        problem = SumOfSquares(
+            model.pack(p), model.unpack, lambda p: model.trial_chi2(p, model.levels),
+            lambda p: model.normal_equations(p, model.levels),
+        )  # fmt: skip
+        p, chi2, settled = minimise(problem, tell, min(_ROUND, max_iterations), enough)
+        if settled or monitor.stopped is not None or monitor.is_over:
+            break
     status = "settled" if settled else "stopped" if monitor.stopped is not None else "not settled"
     of_accelerations = np.sqrt(model.chi2(p, model.levels_of_accelerations))
     return ModalFit(p.modes, p.rigid, float(np.sqrt(chi2)), float(of_accelerations), status, "", weights, static)

@@ -92,9 +92,15 @@ def solve_modes(
     gauge, held = held_gauge(first if by_lines else first._replace(omega=np.arange(float(m))), unit, weighed)
     if modal.static and not by_lines:  # those at one pole stay in the form that they have, without turning
         held[-modal.static :] = (gauge[-modal.static :] == 0) | (not weighed)
+    sizes = ca.MX.ones(m)
+    if weighed:  # by its logarithm, so that a mode that the force gives no mass turns nothing singular on the way
+        largest = np.max(np.abs(gauge), axis=1, keepdims=True)
+        gauge = gauge / largest
+        held = held | (np.arange(d) == np.argmax(np.abs(gauge), axis=1)[:, None])
+        sizes = ca.exp(z.variable("size of participation", np.log(largest[:, 0])))
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
-    gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
+    gamma = ca.diag(sizes) @ z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
     omega, ratios = spectrum(z)
     rigid = gamma.T @ gamma
     if weighed:
@@ -174,12 +180,6 @@ class ModalResidual:
             slope += ca.gradient(ca.sumsqr(self.force_left), z)
         return slope
 
-    def by_rigid(self) -> ca.MX:
-        """Gradient of the value by the rigid-body mass, (d, d)."""
-        if self.force_left is None:
-            return ca.MX(*self.rigid.shape)
-        return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
-
     def theta(self) -> ca.MX:
         """Argument of `hessian_of`: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
         d = self.rigid.size1()
@@ -248,19 +248,23 @@ class EstimateResidual:
 
 
 def hessian_of(model: SpectraModel) -> NumpyFunction:
-    """Hessian of the sum of squares of a model by theta without the shapes, for CasADi."""
+    """Hessian of the sum of squares of a model by theta without the shapes, and its gradient, for CasADi."""
     size = model.kept - model.index.gamma.start
-    return NumpyFunction(size, [(size, size)], lambda x: [2 * model.slopes(model.unpack(x), model.levels)[1]])
+
+    def values(theta: Array) -> tuple[Array, Array]:
+        plain, curved = model.slopes(model.unpack(theta), model.levels)
+        return 2 * curved, -2 * plain.gradient
+
+    return NumpyFunction(size, [(size, size), (size, 1)], values)
 
 
 def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction) -> dict[str, ca.Function]:
     """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()
-    chain = ca.jacobian(theta, unknowns)
-    hessian = chain.T @ of_theta(theta) @ chain
-    # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
-    slope = ca.MX.sym("slope", *error.rigid.shape)
-    bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
+    chain, (curved, slope) = ca.jacobian(theta, unknowns), of_theta(theta)
+    pull = ca.MX.sym("pull", theta.numel())
+    bend = ca.substitute(ca.hessian(ca.dot(pull, theta), unknowns)[0], pull, slope)
+    hessian = chain.T @ curved @ chain
     return {
         "grad_f": z.gradient(error.value, error.gradient(unknowns)),
         "hess_lag": z.hessian(hessian + bend, curved=False),

@@ -1,5 +1,6 @@
 """The program in modal coordinates: its derivatives against CasADi's own, its gauges, and where it ends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -297,6 +298,56 @@ def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, s
     remainder = np.linalg.eigvalsh(end.rigid - end.modes.gamma.T @ end.modes.gamma)
     assert remainder[0] > -1e-12
     assert remainder[-1] < 0.02
+
+
+@pytest.mark.parametrize(("d", "force"), [(1, True), (2, False), (3, True)])
+def test_slopes_and_curvatures_by_the_unknowns_of_an_estimate_are_those_of_differences(random_structure, d, force):
+    """As many modes as directions share a pole; with a force each one's largest participation is by its logarithm."""
+    rng = np.random.default_rng(d)
+    structure = random_structure(rng, n=4, d=d)
+    test, first = trial(rng, structure, force=force, noise=0.02), modes_of(structure)
+    pole = np.maximum(np.arange(4) - d + 1, 0)
+    apart = np.unique(pole, return_index=True)[1]
+    first = first._replace(omega=first.omega[apart][pole], ratios=first.ratios[apart][pole])
+    model = SpectraModel(test, weights_at(test, first.omega[apart], first.ratios[apart]), pole)
+    start = model.with_best_shapes(first, structure.rigid_body_mass)
+    p = model.in_gauge(start, np.full(d, 0.7))
+    assert model.chi2(p, model.levels) == pytest.approx(model.chi2(start, model.levels), rel=1e-9)  # of the same fit
+    x = model.pack(p)
+    np.testing.assert_allclose(model.pack(model.unpack(x)), x, rtol=1e-14)
+    chi2 = lambda at: model.chi2(model.unpack(at), model.levels)  # noqa: E731
+    gradient = lambda at: _exact(model, model.unpack(at))[1]  # noqa: E731
+    steps = 1e-6 * np.eye(x.size)
+    by_differences = np.array([chi2(x + h) - chi2(x - h) for h in steps]) / 2e-6
+    curved, slopes = _exact(model, p)
+    np.testing.assert_allclose(-2 * slopes, by_differences, atol=1e-5 * np.abs(by_differences).max())
+    turned = np.array([gradient(x - h) - gradient(x + h) for h in steps]) / 2e-6
+    np.testing.assert_allclose(curved, turned, atol=1e-5 * np.abs(turned).max())
+
+
+def _exact(model, p):
+    """Half the exact Hessian and minus half the gradient by the unknowns, whatever its curvature."""
+    plain, curved = model.slopes(p, model.levels)
+    joined, bend = model.chain(p.modes.gamma.ravel(), plain.gradient)
+    return joined @ curved @ joined.T + bend, joined @ plain.gradient
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_a_mode_to_which_the_force_gives_no_mass_is_no_trouble(random_structure, d):
+    """Of one mode the force is turned, so that less than no mass would fit it: none is the least that there can be."""
+    rng = np.random.default_rng(d)
+    structure = random_structure(rng, n=4, d=d)
+    truth, test = modes_of(structure), trial(rng, structure, force=True, noise=0.003, lines=200)
+    w, one = 2 * np.pi * test.freq, truth.at(np.array([2]))
+    g = w**2 / (one.omega**2 - w**2 + 2j * one.ratios * one.omega * w)
+    of_one = np.einsum("kd,ke,kf,ref->rdf", one.gamma, one.gamma, g[None], test.base)
+    test, monitor = replace(test, force=test.force - 1.05 * of_one), IterationMonitor(None, None)
+    end = fitted(test, near(rng, truth, 0.02), monitor=monitor)
+    assert end.status in SOLVED and len(monitor.curve) < 60
+    mine = int(np.argmin(np.abs(end.modes.omega - one.omega)))
+    assert np.sum(end.modes.gamma[mine] ** 2) < 1e-6 * np.sum(one.gamma**2)
+    whole = residues(truth)
+    np.testing.assert_allclose(residues(end.modes), whole, atol=0.02 * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
