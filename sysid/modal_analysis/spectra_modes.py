@@ -147,13 +147,13 @@ class ModeFit:
         near, far = omega < times * last, times * last * (1 + ROUND_OFF)
         omega, ratios = np.append(omega[near], times * last), np.append(ratios[near], ratio)
         while True:
-            kept = worthwhile(self.records, omega, ratios, held=1)
-            inside, more = np.count_nonzero(omega[kept] < last), self._beside_static(omega[kept], ratios[kept])
+            inside, more = np.count_nonzero(omega < last), self._beside_static(omega, ratios)
             omega, ratios = _poles_of(more)
-            stays = omega < far  # a pole that passes the static modes stands for what they do
-            if np.all(stays) and worthwhile(self.records, omega, ratios, held=1).size == omega.size:
+            kept = worthwhile(self.records, omega, ratios, held=1)
+            kept = kept[omega[kept] < far]  # a pole that passes the static modes stands for what they do
+            if kept.size == omega.size:
                 break
-            omega, ratios = omega[stays], ratios[stays]
+            omega, ratios = omega[kept], ratios[kept]
         # One that comes into the lines is no mode.
         if more.status != "settled" or np.count_nonzero(omega < last) > inside:
             return best
