@@ -14,7 +14,7 @@ from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
-from sysid.modal_analysis.spectra_model import fit_spectra
+from sysid.modal_analysis.spectra_model import fit_spectra, weights_at
 from sysid.modal_analysis.vector_fitting import Poles, worthwhile
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Array
@@ -72,6 +72,7 @@ def fit_modes_of_lines(
     found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
     if residual and count is None:
         found = fit.with_static(found)
+    found = fit.with_weights_of_runs(found)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
@@ -281,9 +282,21 @@ class ModeFit:
         if test.force is not None:
             t, rigid = weigh(test, modes)
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+        return self._from(modes, rigid, self.static, together=not self.records.unit)
+
+    def _from(self, modes: Modes, rigid: Array, static: int, *, together: bool) -> ModalFit:
         return fit_spectra(
-            test, modes, rigid, static=self.static, monitor=self.monitor, max_iterations=self.max_iterations
+            self.test, modes, rigid, static=static, together=together, monitor=self.monitor,
+            max_iterations=self.max_iterations,
         )  # fmt: skip
+
+    def with_weights_of_runs(self, best: ModalFit) -> ModalFit:
+        """The fit with the weights that channels have in each run, where those of all runs were taken together."""
+        test, weights = self.test, best.weights
+        own = weights_at(test, *_poles_of(best))
+        if weights is None or not self._goes_on or np.allclose(own.sensors, weights.sensors, rtol=ROUND_OFF, atol=0.0):
+            return best
+        return self._from(best.modes, best.rigid, best.static, together=False)
 
 
 def _poles_of(fit: ModalFit) -> tuple[Array, Array]:

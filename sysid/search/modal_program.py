@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
@@ -137,8 +138,8 @@ def solve_modes(
 class ModalResidual:
     """Weighted residual as CasADi expressions, its shapes eliminated.
 
-    `phi` (n, m) are the best shapes, `left` (n, 2 L) the weighted errors of the accelerations, real parts beside
-    imaginary ones, `force_left` (d, 2 L), or None, those of the force, and `value` is their sum of squares.
+    `phi` (n, m) are the best shapes, `parts` hold the weighted errors of the accelerations, `force_left` (d, 2 L), real
+    parts beside imaginary ones, or None, those of the force, and `value` is their sum of squares.
     """
 
     def __init__(
@@ -149,24 +150,22 @@ class ModalResidual:
         self.gamma, self.omega, self.ratios, self.rigid = gamma, omega, ratios, rigid
         gains = modal_gains(omega, ratios, test.freq)
         self.q = ca.horzcat(*modal_motion(test.base * weights.lines[:, None], gamma, gains))
-        target = stacked(columns(test.relative * weights.sensors[:, None] * weights.lines[:, None])).T
-        # Rows of very different size would spoil the solve.
-        scale = ca.sqrt(ca.sum2(self.q**2))
-        scaled = self.q / ca.repmat(scale, 1, self.q.size2())
-        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
-        normal = product(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
-        shapes = ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
-        self.shapes = shapes.T  # of weighted sensors
-        self.left = ca.DM(target) - product(self.shapes, self.q)
-        self.phi = ca.diag(ca.DM(1 / weights.sensors)) @ self.shapes
-        self.value = ca.sumsqr(self.left)
+        of_runs = lambda each: np.tile(np.repeat(each, test.freq.size, axis=0), (2, 1)).T  # noqa: E731 - (c, 2 L)
+        target = of_runs(weights.sensors) * stacked(columns(test.relative * weights.lines[:, None])).T
+        self.parts = [
+            _Sensors(self.q, target[sensors], of_runs(over[:, None]), sensors, weights.sensors[0, sensors])
+            for over, sensors in self.model.groups
+        ]
+        order = np.argsort(np.concatenate([part.sensors for part in self.parts])).tolist()
+        self.phi = ca.vertcat(*(part.phi for part in self.parts))[order, :]
+        self.value = sum((ca.sumsqr(part.left) for part in self.parts), ca.MX(0))
         self.force_left: ca.MX | None = None
         if test.force is not None and weights.force is not None:
             base = test.base * weights.force_lines[:, None]
             q = ca.horzcat(*modal_motion(base, gamma, gains)) if weights.force_lines is not weights.lines else self.q
-            target = stacked(columns(test.force * weights.force[:, None] * weights.force_lines[:, None])).T
-            self.force_channel, self.force_base = ca.DM(weights.force), ca.horzcat(*parts_of(base))
-            self.force_left = ca.diag(self.force_channel) @ (gamma.T @ q + rigid @ self.force_base) - ca.DM(target)
+            of_force = of_runs(weights.force)
+            target = of_force * stacked(columns(test.force * weights.force_lines[:, None])).T
+            self.force_left = ca.DM(of_force) * (gamma.T @ q + rigid @ ca.horzcat(*parts_of(base))) - ca.DM(target)
             self.value += ca.sumsqr(self.force_left)
 
     def gradient(self, z: ca.MX) -> ca.MX:
@@ -174,8 +173,8 @@ class ModalResidual:
 
         The best shapes leave no slope by themselves, so that they count as constants.
         """
-        pull = ca.vec(-2 * product(self.shapes.T, self.left))
-        slope = ca.jtimes(ca.vec(self.q), z, pull, True)
+        pull = sum((part.pull for part in self.parts), ca.MX(*self.q.shape))
+        slope = ca.jtimes(ca.vec(self.q), z, ca.vec(pull), True)
         if self.force_left is not None:
             slope += ca.gradient(ca.sumsqr(self.force_left), z)
         return slope
@@ -196,6 +195,31 @@ class ModalResidual:
         p = model.with_best_shapes(modes, rigid)
         every, of_accelerations = (np.sqrt(model.chi2(p, at)) for at in (model.levels, model.levels_of_accelerations))
         return float(every), float(every), float(of_accelerations)
+
+
+class _Sensors:
+    """Some of the sensors, which weigh the runs alike: their best shapes `phi` and weighted errors `left` (n, 2 L).
+
+    `pull` (m, 2 L) is the gradient of the sum of squares by the motions q of all modes.
+    """
+
+    def __init__(
+        self, q: ca.MX, target: Array, over: Array, sensors: NDArray[np.intp], weights: Array
+    ) -> None:  # fmt: skip
+        self.sensors, by_run = sensors, np.any(over != 1)
+        every = ca.DM(np.repeat(over, q.size1(), axis=0))
+        motions = every * q if by_run else q
+        # Rows of very different size would spoil the solve.
+        scale = ca.sqrt(ca.sum2(motions**2))
+        scaled = motions / ca.repmat(scale, 1, q.size2())
+        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
+        normal = product(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
+        shapes = (ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, sensors.size)).T
+        self.left = ca.DM(target) - product(shapes, motions)
+        self.phi = ca.diag(ca.DM(1 / weights)) @ shapes
+        self.pull = -2 * product(shapes.T, self.left)
+        if by_run:
+            self.pull *= every
 
 
 class EstimateResidual:
