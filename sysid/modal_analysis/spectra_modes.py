@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, weigh
+from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, Weights, separate_poles, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
-from sysid.modal_analysis.spectra_model import fit_spectra, weights_at
+from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
 from sysid.modal_analysis.vector_fitting import Poles, worthwhile
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Array
@@ -72,7 +72,7 @@ def fit_modes_of_lines(
     found = fit.best() if count is None else fit.of_modes(np.ones(count, dtype=int))
     if residual and count is None:
         found = fit.with_static(found)
-    found = fit.with_weights_of_runs(found)
+    found = fit.with_weights_of_runs(found, pruned=count is None)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
@@ -290,13 +290,43 @@ class ModeFit:
             max_iterations=self.max_iterations,
         )  # fmt: skip
 
-    def with_weights_of_runs(self, best: ModalFit) -> ModalFit:
-        """The fit with the weights that channels have in each run, where those of all runs were taken together."""
-        test, weights = self.test, best.weights
-        own = weights_at(test, *_poles_of(best))
-        if weights is None or not self._goes_on or np.allclose(own.sensors, weights.sensors, rtol=ROUND_OFF, atol=0.0):
+    def with_weights_of_runs(self, best: ModalFit, *, pruned: bool) -> ModalFit:
+        """The fit with the weights that channels have in each run, where those of all runs were taken together.
+
+        Where it is `pruned`, without modes that were taken for some by the other weights.
+        """
+        own = weights_at(self.test, *_poles_of(best))
+        every = own.sensors if own.force is None else np.hstack([own.sensors, own.force])
+        if self.records.unit or not self._goes_on or np.allclose(every, every[0], rtol=ROUND_OFF, atol=0.0):
             return best
-        return self._from(best.modes, best.rigid, best.static, together=False)
+        best = self._from(best.modes, best.rigid, best.static, together=False)
+        least = beyond_chance(self.test.n_sensors + self.test.n_base + 1, CANDIDATES)
+        while pruned and self._goes_on and best.of_accelerations > EXACT and best.modes.omega.size > best.static + 1:
+            fewer = self._from(self._without_least(best, own), best.rigid, best.static, together=False)
+            if fewer.residual**2 - best.residual**2 > least * self._variance(best):
+                break
+            best = fewer
+        return best
+
+    def _without_least(self, best: ModalFit, weights: Weights) -> Modes:
+        """Modes of a fit without the one whose loss the records would feel least, all others as they are."""
+        modes, m = best.modes, best.modes.omega.size
+        rise = []
+        for k in range(m - best.static):
+            others = modes.at(np.arange(m) != k)
+            model = SpectraModel(self.test, weights, separate_poles(others)[1])
+            rise.append(model.chi2(model.with_best_shapes(others, best.rigid), model.levels))
+        return modes.at(np.arange(m) != np.argmin(rise))
+
+    def _variance(self, best: ModalFit) -> float:
+        """Share of one real number of the records in what a fit leaves, as it affects smooth functions."""
+        records, test = self.records, self.test
+        free = records.fit(*_poles_of(best))
+        unknowns = free.residues.size
+        shared = records.noise(free.left, unknowns) / records.variance(float(np.sum(free.left**2)), unknowns)
+        numbers = 2 * (test.response.size + (0 if test.force is None else test.force.size))
+        unknowns = best.modes.omega.size * (test.n_sensors + test.n_base + 1)
+        return shared * best.residual**2 / max(numbers - unknowns, 1)
 
 
 def _poles_of(fit: ModalFit) -> tuple[Array, Array]:

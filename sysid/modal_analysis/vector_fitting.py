@@ -102,8 +102,9 @@ def _find(records: Records, progress: _Progress) -> Poles:
     wanted, most = _count(records, progress), _most_poles(records)
     # Where lines are few a spare pole or two must do.
     count = min(wanted, most) if most > wanted - _SPARE else wanted
+    found: tuple[Array, Array] = (np.empty(0), np.empty(0))
     while count <= most:
-        omega, ratios = _search(records, count, progress)
+        found = omega, ratios = _search(records, count, found, progress)
         if omega.size <= count - (_SPARE // 2 if count >= wanted else 1):
             break
         count += max(count // 2, _SPARE)  # too few were spare
@@ -221,8 +222,8 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
     return _prune(records, omega, ratios, progress, velocity=True)
 
 
-def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
-    """Poles that stand out of the noise."""
+def _search(records: Records, count: int, before: tuple[Array, Array], progress: _Progress) -> tuple[Array, Array]:
+    """Poles that stand out of the noise, from `count` that are spread over the lines; and of those found `before`."""
     first = _relocated(records, count, progress)
     poles = _settled(records, *first, progress)
     if poles[0].size == 0:
@@ -231,7 +232,8 @@ def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, A
     if _is_exact(records, by_velocity) and not _is_exact(records, records.fit(*poles).squared_error):
         return _settled(records, *first, progress, velocity=True)  # records without noise, of other damping: no others
     most = poles[0].size + count
-    while poles[0].size < most and (more := _with_another(records, *poles, progress)):
+    tried = np.append(first[0], before[0]), np.append(first[1], before[1])
+    while poles[0].size < most and (more := _with_another(records, *poles, tried, progress)):
         poles = more
     poles = _merged(records, *poles, progress)
     criterion = _criterion(records, poles, velocity=False)
@@ -286,16 +288,19 @@ def _settled(
     return omega, ratios
 
 
-def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
+def _with_another(
+    records: Records, omega: Array, ratios: Array, first: tuple[Array, Array], progress: _Progress
+) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
+    Candidates lie beside each pole, for two modes that share it, and between the poles; and those that there were at
+    `first`, of which one may have gone while others were not in their places. Damping that is not classical
     needs no pole: one more must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
-    at = np.concatenate([np.tile(omega, 4) * shift, between])
-    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
+    at = np.concatenate([np.tile(omega, 4) * shift, between, first[0]])
+    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios)), first[1]])
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
