@@ -293,7 +293,7 @@ def _with_another(
 ) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, and between the poles; and those that there were at
+    Candidates lie beside each pole, for two modes that share it, and between the poles; then those that there were at
     `first`, of which one may have gone while others were not in their places. Damping that is not classical
     needs no pole: one more must fit what the velocities of the poles cannot, or more than they all can.
     """
@@ -304,21 +304,23 @@ def _with_another(
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    least = _least_gain(without_velocity)
-    tried = -1
-    for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
+    least, usual = _least_gain(without_velocity), np.arange(at.size) < at.size - first[0].size
+    tried, gains = -1, []
+    for fit in (with_velocity, without_velocity):
         progress.tell()
         trial, products = fit.beside(plain)
         left = trial.squares()
         gain = np.sum(products**2, axis=1) / np.where(left > least_left, left, np.inf)
-        gain = gain.reshape(at.size, -1).sum(axis=1)
-        best = int(np.argmax(gain))
-        if best == tried or gain[best] <= least * _noise(records, fit, omega.size):
-            continue
-        tried = best
-        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
-            return more
+        gains.append(gain.reshape(at.size, -1).sum(axis=1) / _noise(records, fit, omega.size))
+    for among in (usual, ~usual):
+        for gain, to_beat in zip(gains, (np.inf, with_velocity.squared_error), strict=True):
+            best = int(np.argmax(np.where(among, gain, 0.0)))
+            if best == tried or not among[best] or gain[best] <= least:
+                continue
+            tried = best
+            more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
+            if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+                return more
     return None
 
 
