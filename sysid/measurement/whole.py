@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, finite_array, instance, refuse, sequence
 from sysid.measurement.spectra import TimeRun, check_runs, of_run
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import NEGLIGIBLE
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +338,34 @@ def separable(std: Array | None, shape: tuple[int, int, int]) -> tuple[Array, Ar
     weight = -np.log(floored)
     channel = weight.mean(axis=(0, 2))
     return np.exp(channel), np.exp((weight - channel[:, None]).mean(axis=1))
+
+
+def products(std: Array | None, shape: tuple[int, int, int]) -> list[tuple[NDArray[np.intp], Array, Array]]:
+    """`separable` weights of as many runs together as share their factors of the channels: of all, or of each alone.
+
+    Numbers of runs (r,), weights of channels (channels,) and of lines (r, n_freq). The deviations of different runs are
+    seldom one product: what one direction of the base moves most, another hardly does.
+    """
+    runs, every, std = np.arange(shape[0]), separable(std, shape), raised(std)
+    each = [separable(None if std is None else std[[run]], (1, *shape[1:])) for run in runs]
+    channel = np.array([one / np.exp(np.log(one).mean()) for one, _ in each])
+    if np.allclose(channel, channel[0], rtol=ROUND_OFF, atol=0.0):
+        return [(runs, *every)]
+    return [(runs[[run]], *one) for run, one in enumerate(each)]
+
+
+def factors_of_runs(
+    std: Array | None, shape: tuple[int, int, int], *, together: bool = False
+) -> tuple[Array, Array]:  # fmt: skip
+    """`products` as weights of the channels in each run, (runs, channels), and of lines, (runs, n_freq).
+
+    With `together` channels weigh alike in all runs.
+    """
+    groups = [(np.arange(shape[0]), *separable(std, shape))] if together else products(std, shape)
+    of_channels, of_lines = np.empty(shape[:2]), np.empty((shape[0], shape[2]))
+    for runs, channel, line in groups:
+        of_channels[runs], of_lines[runs] = channel, line
+    return of_channels, of_lines
 
 
 def raised(std: Array | None) -> Array | None:

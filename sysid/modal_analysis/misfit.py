@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import separable
+from sysid.measurement.whole import products
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, stacked
+from sysid.modal_analysis.response import columns, stacked, weights_of_numbers
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import EPSILON, beyond_chance
 
@@ -22,26 +23,32 @@ _FAR_BELOW = 0.1  # reduced chi-squared of a misfit, as of round-off, that tells
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Noise and misfit of the responses or of the force, (channels, runs * n_freq), and the weights of the fit."""
+    """Noise and misfit of the responses or of the force, (channels, runs * n_freq), and the weights of the fit.
+
+    `weights` are those of `products`, whose runs share one Gram matrix but for a factor a channel.
+    """
 
     std: Array
     misfit: ComplexArray
-    by_channel: Array
-    by_line: Array
+    weight: Array
+    weights: list[tuple[NDArray[np.intp], Array, Array]]
 
     @property
     def shared(self) -> bool:
         """True where the weights of the fit are those of the noise."""
-        return bool(np.all(np.abs(self.by_channel[:, None] * self.by_line * self.std - 1) < 1e-9))
+        return bool(np.all(np.abs(self.weight * self.std - 1) < 1e-9))
 
     def grams(self, spectra: ComplexArray) -> Iterator[Array]:
-        """``Re V' W V`` of each channel, W the squared weights: one Gram matrix but for a factor."""
-        gram = _gram(spectra * self.by_line)
-        return (weight**2 * gram for weight in self.by_channel)
+        """``Re V' W V`` of each channel, W the squared weights."""
+        n_runs = sum(runs.size for runs, _, _ in self.weights)
+        by_run = spectra.reshape(len(spectra), n_runs, -1)
+        parts = [(by_run[:, runs] * line).reshape(len(spectra), -1) for runs, _, line in self.weights]
+        together, channels = np.array([_gram(part) for part in parts]), np.array([one for _, one, _ in self.weights])
+        return (np.tensordot(each**2, together, 1) for each in channels.T)
 
     def sandwich_grams(self, spectra: ComplexArray) -> Iterator[Array]:
         """``Re V' W S W V`` of each channel, S the variances of the noise."""
-        return (_gram(spectra * row) for row in (self.by_channel[:, None] * self.by_line) ** 2 * self.std)
+        return (_gram(spectra * row) for row in self.weight**2 * self.std)
 
 
 def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[tuple[ComplexArray, Array]]:
@@ -68,8 +75,8 @@ def noise_records(test: Measurement, structure: Structure, unknowns: int) -> lis
     """Records of the responses and, where measured, of the force; inferred noise allows for the number of unknowns."""
     records = []
     for misfit, std in misfits_of(test, structure, unknowns):
-        by_channel, by_line = separable(std, std.shape)
-        records.append(Record(columns(std + 0j).real, columns(misfit), by_channel, by_line.ravel()))
+        weight, weights = weights_of_numbers(std, std.shape), products(std, std.shape)
+        records.append(Record(columns(std + 0j).real, columns(misfit), weight, weights))
     return records
 
 

@@ -151,16 +151,16 @@ def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of plain spectra: one factor a channel and one a line.
+    """Weights of plain spectra: in each run one factor a channel and one a line.
 
     With them the sum of squares of the accelerations' errors is relative to that of the weighted accelerations.
 
     Attributes
     ----------
-    sensors : (n,)
+    sensors : (runs, n)
     lines : (runs, n_freq)
         Of the accelerations.
-    force : (d,) or None
+    force : (runs, d) or None
     force_lines : (runs, n_freq)
         Of the force; the same array as `lines` where both weigh their lines alike.
     """

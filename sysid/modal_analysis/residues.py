@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import separable
+from sysid.measurement.whole import factors_of_runs
 from sysid.modal_analysis.pole_functions import Basis, Beside, OfRun, PoleFunctions, orthonormal, unit_columns
 from sysid.modal_analysis.response import columns, gains, gains_and_slopes, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
@@ -126,9 +126,10 @@ class Records:
         record, std = (test.force, test.force_std) if force else (test.relative, test.response_std)
         assert record is not None
         self.n_sensors, self.n_base = record.shape[1], test.inputs.shape[1]
-        channel, line = separable(std, record.shape)
-        relative = record * channel[:, None]
         self.unit = test.whole is None and test.has_unit_runs
+        # Runs that share functions of frequency weigh channels alike.
+        channel, line = factors_of_runs(std, record.shape, together=not self.unit)
+        relative = record * channel[..., None]
         if self.unit:
             size = np.exp(np.log(line).mean(axis=1, keepdims=True))  # of each run
             shared = np.exp(np.log(line / size).mean(axis=0))
@@ -139,7 +140,7 @@ class Records:
             self.moving, self.driven = independent_inputs(test)
             base = np.einsum("di,rdf->rif", self.moving, test.inputs * line[:, None])
             blocks = list(zip(base, relative * line[:, None], strict=True))
-            self.channel = channel
+            self.channel = channel[0]
         self.blocks = blocks
         # Whole records of other lengths have zeros at the lines of one another, which tell nothing.
         used = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import separable
+from sysid.measurement.whole import products, separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
@@ -150,10 +150,17 @@ def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, f
     return found
 
 
+def weights_of_numbers(std: Array | None, shape: tuple[int, int, int]) -> Array:
+    """Weights of a record's numbers, `products` of channels and lines, as `columns` has them."""
+    every = np.empty((shape[1], shape[0], shape[2]))
+    for runs, channel, line in products(std, shape):
+        every[:, runs] = channel[:, None, None] * line
+    return every.reshape(shape[1], -1)
+
+
 def weights_of(record: ComplexArray, std: Array | None) -> tuple[Array, float]:
-    """Weights of a record's channels and lines as `columns` has them, and the size of the weighted record."""
-    channel, line = separable(std, record.shape)
-    weight = channel[:, None] * line.ravel()
+    """`weights_of_numbers` of a record, and the size of the weighted record."""
+    weight = weights_of_numbers(std, record.shape)
     return weight, float(np.linalg.norm(weight * columns(record)))
 
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, separate_poles, too_few, weigh
+from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, Weights, separate_poles, too_few, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
-from sysid.modal_analysis.spectra_model import fit_spectra
-from sysid.modal_analysis.vector_fitting import Poles
+from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
+from sysid.modal_analysis.vector_fitting import Poles, worthwhile
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, EXACT, ROUND_OFF, beyond_chance
@@ -78,6 +78,7 @@ def fit_modes_of_lines(
     found = fit.best() if count is None else fit.of_count(counts, ours)
     if residual:
         found = fit.with_static(found)
+    found = fit.with_weights_of_runs(found, pruned=count is None)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
@@ -107,7 +108,19 @@ class ModeFit:
         return Records(self.test)
 
     def best(self) -> ModalFit:
-        """The fit of as many modes as the records need."""
+        """The fit of as many modes as the records need.
+
+        Modes of rank one may have dragged a pole to where noise explains it: it is left out.
+        """
+        best = self._best_at_all()
+        omega, ratios = _poles_of(best)
+        kept = worthwhile(self.records, omega, ratios)
+        if not self._goes_on or best.of_accelerations <= EXACT or kept.size in (0, omega.size):
+            return best
+        return replace(self, poles=replace(self.poles, omega=omega[kept], ratios=ratios[kept])).best()
+
+    def _best_at_all(self) -> ModalFit:
+        """The fit of as many modes as the records need at all poles."""
         test, records, poles = self.test, self.records, self.poles
         m, n, d = poles.omega.size, test.n_sensors, test.n_base
         single = np.ones(m, dtype=int)
@@ -138,21 +151,23 @@ class ModeFit:
         if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
-        first, pole = separate_poles(best.modes)
-        found, near = best.modes.omega[first], best.modes.omega[first] < times * last
-        omega, ratios = np.append(found[near], times * last), np.append(best.modes.ratios[first][near], ratio)
-        counts = np.append(np.ones_like(first) if self.grows else np.bincount(pole), test.n_base)[np.append(near, True)]
-        kept = self._worthwhile(omega, ratios)
-        omega, ratios, counts = omega[kept], ratios[kept], counts[kept]
-        more = self._beside_static(omega, ratios, counts)
-        far = times * last * (1 + ROUND_OFF)
-        stays = more.modes.omega[separate_poles(more.modes)[0]] < far
-        if not np.all(stays):  # a pole that passes the static modes stands for what they do
-            omega, ratios, counts = omega[stays], ratios[stays], counts[stays]
-            more = self._beside_static(omega, ratios, counts)
-        inside = np.count_nonzero(omega < last), np.count_nonzero(np.unique(more.modes.omega) < last)
+        omega, ratios = _poles_of(best)
+        near, far = omega < times * last, times * last * (1 + ROUND_OFF)
+        counts = np.ones_like(omega, dtype=int) if self.grows else np.bincount(separate_poles(best.modes)[1])
+        omega, ratios = np.append(omega[near], times * last), np.append(ratios[near], ratio)
+        counts = np.append(counts[near], test.n_base)
+        while True:
+            inside, more = np.count_nonzero(omega < last), self._beside_static(omega, ratios, counts)
+            omega, ratios = _poles_of(more)
+            kept = worthwhile(self.records, omega, ratios, held=1)
+            kept = kept[omega[kept] < far]  # a pole that passes the static modes stands for what they do
+            if not self.grows:  # those within the lines are asked for
+                kept = np.union1d(kept, np.flatnonzero(omega <= last))
+            if kept.size == omega.size:
+                break
+            omega, ratios, counts = omega[kept], ratios[kept], counts[kept]
         # One that comes into the lines is no mode.
-        if more.status != "settled" or inside[0] != inside[1] or np.any(more.modes.omega > far):
+        if more.status != "settled" or np.count_nonzero(omega < last) > inside:
             return best
         unknowns = (more.modes.omega.size - best.modes.omega.size) * (test.n_sensors + d)
         gained = (best.residual**2 - more.residual**2) * self.records.size
@@ -165,27 +180,15 @@ class ModeFit:
         found = fit.of_modes(counts)
         return fit._grown(found, counts) if self.grows else found
 
-    def _worthwhile(self, omega: Array, ratios: Array) -> Integers:
-        """Poles that noise does not explain beside the last one: some stood for what that explains."""
-        subsets, kept = SubsetFits(self.records, omega, ratios), np.arange(omega.size)
-        while kept.size > 1:
-            worth, _ = subsets.worth(kept)
-            asked_for = not self.grows and omega[kept] <= 2 * np.pi * self.test.freq[-1]
-            least = int(np.argmin(np.where(asked_for, np.inf, worth)[:-1]))
-            if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
-                break
-            kept = np.delete(kept, least)
-        return kept
-
     def _misses_static(self, best: ModalFit) -> bool:
         """True where what free residues leave at the poles of a fit grows as w², beyond chance.
 
         Beside a constant, which a wrong gain makes.
         """
-        records, first = self.records, separate_poles(best.modes)[0]
+        records = self.records
         if best.of_accelerations <= EXACT:
             return False
-        free = records.fit(best.modes.omega[first], best.modes.ratios[first])
+        free = records.fit(*_poles_of(best))
         rise = modes_above(self.test.freq, self.test.freq[-1])[:1]
         beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
         rising = records.basis(rise + 0j)
@@ -314,6 +317,54 @@ class ModeFit:
         if test.force is not None:
             t, rigid = weigh(test, modes)
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+        return self._from(modes, rigid, self.static, together=not self.records.unit)
+
+    def _from(self, modes: Modes, rigid: Array, static: int, *, together: bool) -> ModalFit:
         return fit_spectra(
-            test, modes, rigid, static=self.static, monitor=self.monitor, max_iterations=self.max_iterations
+            self.test, modes, rigid, static=static, together=together, monitor=self.monitor,
+            max_iterations=self.max_iterations,
         )  # fmt: skip
+
+    def with_weights_of_runs(self, best: ModalFit, *, pruned: bool) -> ModalFit:
+        """The fit with the weights that channels have in each run, where those of all runs were taken together.
+
+        Where it is `pruned`, without modes that were taken for some by the other weights.
+        """
+        own = weights_at(self.test, *_poles_of(best))
+        every = own.sensors if own.force is None else np.hstack([own.sensors, own.force])
+        if self.records.unit or not self._goes_on or np.allclose(every, every[0], rtol=ROUND_OFF, atol=0.0):
+            return best
+        best = self._from(best.modes, best.rigid, best.static, together=False)
+        least = beyond_chance(self.test.n_sensors + self.test.n_base + 1, CANDIDATES)
+        while pruned and self._goes_on and best.of_accelerations > EXACT and best.modes.omega.size > best.static + 1:
+            fewer = self._from(self._without_least(best, own), best.rigid, best.static, together=False)
+            if fewer.residual**2 - best.residual**2 > least * self._variance(best):
+                break
+            best = fewer
+        return best
+
+    def _without_least(self, best: ModalFit, weights: Weights) -> Modes:
+        """Modes of a fit without the one whose loss the records would feel least, all others as they are."""
+        modes, m = best.modes, best.modes.omega.size
+        rise = []
+        for k in range(m - best.static):
+            others = modes.at(np.arange(m) != k)
+            model = SpectraModel(self.test, weights, separate_poles(others)[1])
+            rise.append(model.chi2(model.with_best_shapes(others, best.rigid), model.levels))
+        return modes.at(np.arange(m) != np.argmin(rise))
+
+    def _variance(self, best: ModalFit) -> float:
+        """Share of one real number of the records in what a fit leaves, as it affects smooth functions."""
+        records, test = self.records, self.test
+        free = records.fit(*_poles_of(best))
+        unknowns = free.residues.size
+        shared = records.noise(free.left, unknowns) / records.variance(float(np.sum(free.left**2)), unknowns)
+        numbers = 2 * (test.response.size + (0 if test.force is None else test.force.size))
+        unknowns = best.modes.omega.size * (test.n_sensors + test.n_base + 1)
+        return shared * best.residual**2 / max(numbers - unknowns, 1)
+
+
+def _poles_of(fit: ModalFit) -> tuple[Array, Array]:
+    """Circular frequencies and damping ratios of the poles of a fit, each once, in its order."""
+    modes = fit.modes.at(separate_poles(fit.modes)[0])
+    return modes.omega, modes.ratios

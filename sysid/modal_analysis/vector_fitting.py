@@ -102,8 +102,9 @@ def _find(records: Records, progress: _Progress) -> Poles:
     wanted, most = _count(records, progress), _most_poles(records)
     # Where lines are few a spare pole or two must do.
     count = min(wanted, most) if most > wanted - _SPARE else wanted
+    found: tuple[Array, Array] = (np.empty(0), np.empty(0))
     while count <= most:
-        omega, ratios = _search(records, count, progress)
+        found = omega, ratios = _search(records, count, found, progress)
         if omega.size <= count - (_SPARE // 2 if count >= wanted else 1):
             break
         count += max(count // 2, _SPARE)  # too few were spare
@@ -236,8 +237,8 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
     return _prune(records, omega, ratios, progress, velocity=True)
 
 
-def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
-    """Poles that stand out of the noise."""
+def _search(records: Records, count: int, before: tuple[Array, Array], progress: _Progress) -> tuple[Array, Array]:
+    """Poles that stand out of the noise, from `count` that are spread over the lines; and of those found `before`."""
     first = _relocated(records, count, progress)
     poles = _settled(records, *first, progress)
     if poles[0].size == 0:
@@ -246,7 +247,8 @@ def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, A
     if _is_exact(records, by_velocity) and not _is_exact(records, records.fit(*poles).squared_error):
         return _settled(records, *first, progress, velocity=True)  # records without noise, of other damping: no others
     most = poles[0].size + count
-    while poles[0].size < most and (more := _with_another(records, *poles, progress)):
+    tried = np.append(first[0], before[0]), np.append(first[1], before[1])
+    while poles[0].size < most and (more := _with_another(records, *poles, tried, progress)):
         poles = more
     poles = _merged(records, *poles, progress)
     criterion = _criterion(records, poles, velocity=False)
@@ -301,12 +303,15 @@ def _settled(
     return omega, ratios
 
 
-def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
+def _with_another(
+    records: Records, omega: Array, ratios: Array, first: tuple[Array, Array], progress: _Progress
+) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
     Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
-    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
-    must fit what the velocities of the poles cannot, or more than they all can.
+    where most is left, as they may have cost another its pole; then those that there were at `first`, of which one may
+    have gone while others were not in their places. Damping that is not classical needs no pole: one more must fit what
+    the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
@@ -315,25 +320,27 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
-    at = np.concatenate([np.tile(omega, 4) * shift, between])
-    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
+    at = np.concatenate([np.tile(omega, 4) * shift, between, first[0]])
+    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios)), first[1]])
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
-    least = _least_gain(without_velocity)
-    tried = -1
-    for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
+    least, usual = _least_gain(without_velocity), np.arange(at.size) < at.size - first[0].size
+    tried, gains = -1, []
+    for fit in (with_velocity, without_velocity):
         progress.tell()
         trial, products = fit.beside(plain)
         left = trial.squares()
         gain = np.sum(products**2, axis=1) / np.where(left > least_left, left, np.inf)
-        gain = gain.reshape(at.size, -1).sum(axis=1)
-        best = int(np.argmax(gain))
-        if best == tried or gain[best] <= least * _noise(records, fit, omega.size):
-            continue
-        tried = best
-        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
-            return more
+        gains.append(gain.reshape(at.size, -1).sum(axis=1) / _noise(records, fit, omega.size))
+    for among in (usual, ~usual):
+        for gain, to_beat in zip(gains, (np.inf, with_velocity.squared_error), strict=True):
+            best = int(np.argmax(np.where(among, gain, 0.0)))
+            if best == tried or not among[best] or gain[best] <= least:
+                continue
+            tried = best
+            more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
+            if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+                return more
     return None
 
 
@@ -356,20 +363,32 @@ def _noise(records: Records, fit: ResidueFit, m: int) -> float:
 def _prune(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
-    """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
+    """Poles without those that do not earn their place."""
+    kept = worthwhile(records, omega, ratios, progress.step, velocity=velocity)
+    return omega[kept], ratios[kept]
+
+
+def worthwhile(
+    records: Records, omega: Array, ratios: Array, step: Callable[[float], object] = lambda _: None, *,
+    velocity: bool = False, held: int = 0,
+) -> NDArray[np.intp]:  # fmt: skip
+    """Numbers of the poles of which each lowers the squared error by far more than noise would, ascending.
+
+    The others are left out one by one, the least useful first, but for so many at the end that are `held`; `step` is
+    called with the squared error that those left give.
+    """
     kept = np.flatnonzero(_may_be_modes(records, omega, ratios))  # others go first, whatever they explain
-    subsets = None
-    while kept.size:
-        if subsets is None or 2 * kept.size < subsets.size:
-            omega, ratios, kept = omega[kept], ratios[kept], np.arange(kept.size)
-            subsets = SubsetFits(records, omega, ratios, velocity=velocity)
-        worth, squared_error = subsets.worth(kept)
-        progress.step(squared_error)
-        least = int(np.argmin(worth))
+    of, subsets = kept, None
+    while kept.size > held:
+        if subsets is None or 2 * kept.size < of.size:
+            of, subsets = kept, SubsetFits(records, omega[kept], ratios[kept], velocity=velocity)
+        worth, squared_error = subsets.worth(np.searchsorted(of, kept))
+        step(squared_error)
+        least = int(np.argmin(worth[: kept.size - held]))
         if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
             break
         kept = np.delete(kept, least)
-    return omega[kept], ratios[kept]
+    return kept
 
 
 def _may_be_modes(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:

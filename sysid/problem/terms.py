@@ -76,8 +76,8 @@ class Term(Protocol):
 class TestTerm:
     """The records of a test, each weighed by its noise.
 
-    The weight of a record's channel and line is the inverse of its stated standard deviation, as a product of one
-    factor a channel and one a line of each run (`separable`): a diagonal weight matrix a line. `matrices` are those of
+    The weight of a record's channel and line is the inverse of its stated standard deviation, in each run as a product
+    of one factor a channel and one a line (`products`): a diagonal weight matrix a line. `matrices` are those of
     the structure as it was in this test; `weight` is that of the whole test, so that all tests count by their noise;
     `shift`, 1/s, that of the complex frequencies s = shift + i w at which the records are given.
     """

@@ -21,7 +21,7 @@ import scipy
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import separable
+from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
@@ -156,11 +156,9 @@ def _errors_of(test: Measurement, modes: int) -> Iterator[tuple[ModalError, bool
     """The errors of accelerations and, where it was measured, base force, in the weights of the objective."""
     weighed = zip(records_of(test), weights_of_test(test, weighted=True), strict=True)
     for of_force, ((record, std), (_, scale)) in enumerate(weighed):
-        channel, line = separable(std, record.shape)
-        yield (
-            ModalError(test.base, record, test.freq, channel / scale, line, modes=modes, with_base=bool(of_force)),
-            bool(of_force),
-        )
+        for runs, channel, line in products(std, record.shape):
+            of_runs = test.base[runs], record[runs], test.freq, channel / scale, line
+            yield ModalError(*of_runs, modes=modes, with_base=bool(of_force)), bool(of_force)
 
 
 def skew_symmetric(entries: ca.MX, n: int) -> ca.MX:

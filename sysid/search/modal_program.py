@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
@@ -92,9 +93,15 @@ def solve_modes(
     gauge, held = held_gauge(first if by_lines else first._replace(omega=np.arange(float(m))), unit, weighed)
     if modal.static and not by_lines:  # those at one pole stay in the form that they have, without turning
         held[-modal.static :] = (gauge[-modal.static :] == 0) | (not weighed)
+    sizes = ca.MX.ones(m)
+    if weighed:  # by its logarithm, so that a mode that the force gives no mass turns nothing singular on the way
+        largest = np.max(np.abs(gauge), axis=1, keepdims=True)
+        gauge = gauge / largest
+        held = held | (np.arange(d) == np.argmax(np.abs(gauge), axis=1)[:, None])
+        sizes = ca.exp(z.variable("size of participation", np.log(largest[:, 0])))
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
-    gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
+    gamma = ca.diag(sizes) @ z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
     omega, ratios = spectrum(z)
     rigid = gamma.T @ gamma
     if weighed:
@@ -131,8 +138,8 @@ def solve_modes(
 class ModalResidual:
     """Weighted residual as CasADi expressions, its shapes eliminated.
 
-    `phi` (n, m) are the best shapes, `left` (n, 2 L) the weighted errors of the accelerations, real parts beside
-    imaginary ones, `force_left` (d, 2 L), or None, those of the force, and `value` is their sum of squares.
+    `phi` (n, m) are the best shapes, `parts` hold the weighted errors of the accelerations, `force_left` (d, 2 L), real
+    parts beside imaginary ones, or None, those of the force, and `value` is their sum of squares.
     """
 
     def __init__(
@@ -143,24 +150,22 @@ class ModalResidual:
         self.gamma, self.omega, self.ratios, self.rigid = gamma, omega, ratios, rigid
         gains = modal_gains(omega, ratios, test.freq)
         self.q = ca.horzcat(*modal_motion(test.base * weights.lines[:, None], gamma, gains))
-        target = stacked(columns(test.relative * weights.sensors[:, None] * weights.lines[:, None])).T
-        # Rows of very different size would spoil the solve.
-        scale = ca.sqrt(ca.sum2(self.q**2))
-        scaled = self.q / ca.repmat(scale, 1, self.q.size2())
-        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
-        normal = product(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
-        shapes = ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
-        self.shapes = shapes.T  # of weighted sensors
-        self.left = ca.DM(target) - product(self.shapes, self.q)
-        self.phi = ca.diag(ca.DM(1 / weights.sensors)) @ self.shapes
-        self.value = ca.sumsqr(self.left)
+        of_runs = lambda each: np.tile(np.repeat(each, test.freq.size, axis=0), (2, 1)).T  # noqa: E731 - (c, 2 L)
+        target = of_runs(weights.sensors) * stacked(columns(test.relative * weights.lines[:, None])).T
+        self.parts = [
+            _Sensors(self.q, target[sensors], of_runs(over[:, None]), sensors, weights.sensors[0, sensors])
+            for over, sensors in self.model.groups
+        ]
+        order = np.argsort(np.concatenate([part.sensors for part in self.parts])).tolist()
+        self.phi = ca.vertcat(*(part.phi for part in self.parts))[order, :]
+        self.value = sum((ca.sumsqr(part.left) for part in self.parts), ca.MX(0))
         self.force_left: ca.MX | None = None
         if test.force is not None and weights.force is not None:
             base = test.base * weights.force_lines[:, None]
             q = ca.horzcat(*modal_motion(base, gamma, gains)) if weights.force_lines is not weights.lines else self.q
-            target = stacked(columns(test.force * weights.force[:, None] * weights.force_lines[:, None])).T
-            self.force_channel, self.force_base = ca.DM(weights.force), ca.horzcat(*parts_of(base))
-            self.force_left = ca.diag(self.force_channel) @ (gamma.T @ q + rigid @ self.force_base) - ca.DM(target)
+            of_force = of_runs(weights.force)
+            target = of_force * stacked(columns(test.force * weights.force_lines[:, None])).T
+            self.force_left = ca.DM(of_force) * (gamma.T @ q + rigid @ ca.horzcat(*parts_of(base))) - ca.DM(target)
             self.value += ca.sumsqr(self.force_left)
 
     def gradient(self, z: ca.MX) -> ca.MX:
@@ -168,17 +173,11 @@ class ModalResidual:
 
         The best shapes leave no slope by themselves, so that they count as constants.
         """
-        pull = ca.vec(-2 * product(self.shapes.T, self.left))
-        slope = ca.jtimes(ca.vec(self.q), z, pull, True)
+        pull = sum((part.pull for part in self.parts), ca.MX(*self.q.shape))
+        slope = ca.jtimes(ca.vec(self.q), z, ca.vec(pull), True)
         if self.force_left is not None:
             slope += ca.gradient(ca.sumsqr(self.force_left), z)
         return slope
-
-    def by_rigid(self) -> ca.MX:
-        """Gradient of the value by the rigid-body mass, (d, d)."""
-        if self.force_left is None:
-            return ca.MX(*self.rigid.shape)
-        return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
 
     def theta(self) -> ca.MX:
         """Argument of `hessian_of`: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
@@ -196,6 +195,31 @@ class ModalResidual:
         p = model.with_best_shapes(modes, rigid)
         every, of_accelerations = (np.sqrt(model.chi2(p, at)) for at in (model.levels, model.levels_of_accelerations))
         return float(every), float(every), float(of_accelerations)
+
+
+class _Sensors:
+    """Some of the sensors, which weigh the runs alike: their best shapes `phi` and weighted errors `left` (n, 2 L).
+
+    `pull` (m, 2 L) is the gradient of the sum of squares by the motions q of all modes.
+    """
+
+    def __init__(
+        self, q: ca.MX, target: Array, over: Array, sensors: NDArray[np.intp], weights: Array
+    ) -> None:  # fmt: skip
+        self.sensors, by_run = sensors, np.any(over != 1)
+        every = ca.DM(np.repeat(over, q.size1(), axis=0))
+        motions = every * q if by_run else q
+        # Rows of very different size would spoil the solve.
+        scale = ca.sqrt(ca.sum2(motions**2))
+        scaled = motions / ca.repmat(scale, 1, q.size2())
+        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
+        normal = product(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
+        shapes = (ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, sensors.size)).T
+        self.left = ca.DM(target) - product(shapes, motions)
+        self.phi = ca.diag(ca.DM(1 / weights)) @ shapes
+        self.pull = -2 * product(shapes.T, self.left)
+        if by_run:
+            self.pull *= every
 
 
 class EstimateResidual:
@@ -248,19 +272,23 @@ class EstimateResidual:
 
 
 def hessian_of(model: SpectraModel) -> NumpyFunction:
-    """Hessian of the sum of squares of a model by theta without the shapes, for CasADi."""
+    """Hessian of the sum of squares of a model by theta without the shapes, and its gradient, for CasADi."""
     size = model.kept - model.index.gamma.start
-    return NumpyFunction(size, [(size, size)], lambda x: [2 * model.slopes(model.unpack(x), model.levels)[1]])
+
+    def values(theta: Array) -> tuple[Array, Array]:
+        plain, curved = model.slopes(model.unpack(theta), model.levels)
+        return 2 * curved, -2 * plain.gradient
+
+    return NumpyFunction(size, [(size, size), (size, 1)], values)
 
 
 def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction) -> dict[str, ca.Function]:
     """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()
-    chain = ca.jacobian(theta, unknowns)
-    hessian = chain.T @ of_theta(theta) @ chain
-    # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
-    slope = ca.MX.sym("slope", *error.rigid.shape)
-    bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
+    chain, (curved, slope) = ca.jacobian(theta, unknowns), of_theta(theta)
+    pull = ca.MX.sym("pull", theta.numel())
+    bend = ca.substitute(ca.hessian(ca.dot(pull, theta), unknowns)[0], pull, slope)
+    hessian = chain.T @ curved @ chain
     return {
         "grad_f": z.gradient(error.value, error.gradient(unknowns)),
         "hess_lag": z.hessian(hessian + bend, curved=False),

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from sysid.measurement.whole import separable
+from sysid.measurement.whole import products
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
 from sysid.models.expressions import triangle
@@ -73,13 +73,16 @@ class HeldSpectrumObjective:
         self.expansion, self._share = expansion, term.weight**2
         self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
         recovery = term.matrices.recovery, np.eye(problem.geometry.d)
-        self._records: list[tuple[SummedRecord, float]] = []
+        # Of accelerations, and of the force where it was measured.
+        self._records: tuple[list[tuple[SummedRecord, float]], list[tuple[SummedRecord, float]]] = ([], [])
         sizes: list[tuple[float, float]] = []
         scales = weights_of_test(test, weighted=True)
-        for (record, std), (_, scale), seen in zip(records_of(test), scales, recovery, strict=False):
-            weights = separable(std, record.shape)
-            summed = SummedRecord(record, test.base, *weights, seen, self._series, static=bool(self._records))
-            self._records.append((summed, scale**2))
+        every = zip(self._records, records_of(test), scales, recovery, strict=False)
+        for summed, (record, std), (_, scale), seen in every:
+            static = summed is self._records[1]
+            for runs, channel, line in products(std, record.shape):
+                of_runs = record[runs], test.base[runs], channel, line
+                summed.append((SummedRecord(*of_runs, seen, self._series, static=static), scale**2))
             sizes.append((weights_of(record, std)[1], scale))
         # Where less than this is left, lines are summed: the difference of large numbers that stands for the square has
         # lost half of its digits there. A record that weighs more than the accelerations loses its digits earlier.
@@ -111,16 +114,18 @@ class HeldSpectrumObjective:
         return squared[: count - start], self._series.holds(ratios[: count - start, :, 0])
 
     def _squared(self, ratios: Array, modes: BatchModes) -> Array:
-        polynomials, inner = self._series.polynomials(ratios), None
-        (accelerations, size), *of_force = self._records
-        squared = np.zeros(len(modes.loads))
-        for force, size_of_force in of_force:
+        polynomials, n = self._series.polynomials(ratios), modes.shapes.shape[1]
+        of_accelerations, of_force = self._records
+        squared, shared = np.zeros(len(modes.loads)), None
+        for force, size in of_force:
             shapes, loads = _of_force(modes)
             of_all = force.inner(loads, polynomials)
-            squared += force.squared(shapes, loads, polynomials, of_all) / size_of_force
-            n = modes.shapes.shape[1]
-            inner = np.ascontiguousarray(of_all[:, :n, :n]) if accelerations.weighs_like(force) else None
-        return squared + accelerations.squared(modes.shapes, modes.loads, polynomials, inner) / size
+            squared += force.squared(shapes, loads, polynomials, of_all) / size
+            if len(of_accelerations) == len(of_force) == 1 and of_accelerations[0][0].weighs_like(force):
+                shared = np.ascontiguousarray(of_all[:, :n, :n])
+        for accelerations, size in of_accelerations:
+            squared += accelerations.squared(modes.shapes, modes.loads, polynomials, shared) / size
+        return squared
 
 
 def chunk_ends(count: int, size: int) -> list[int]:

@@ -200,16 +200,19 @@ class TestAgainstTheDenseJacobian:
                 wanted = np.sqrt(np.einsum("...p,pq,...q->...", rows, covariance, rows.conj()).real)
                 np.testing.assert_allclose(got, wanted, rtol=1e-5)
 
-    @pytest.mark.parametrize("separable", [True, False])
+    @pytest.mark.parametrize("separable", [True, "in each run", False])
     def test_noise_that_varies(self, random_structure, separable):
-        """Weights are one number a sensor times one a line: the noise's own where it is of this kind, else geometric
-        means of it, and the covariance is then the sandwich."""
+        """Weights of a run are one number a sensor times one a line: the noise's own where it is of this kind, else
+        geometric means of it, and the covariance is then the sandwich."""
         rng = np.random.default_rng(7)
         truth = random_structure(rng, 3, 2)
         clean = sysid.simulate(truth, FREQ, force=True)
         shape, push = clean.response.shape, clean.force.shape
         std = 0.01 * rng.uniform(0.5, 2, (1, shape[1], 1)) * rng.uniform(0.5, 2, (shape[0], 1, shape[2]))
         force_std = np.full(push, 0.02)
+        if separable == "in each run":
+            runs = len(clean.base)
+            std, force_std = (one * rng.uniform(0.3, 3, (runs, one.shape[1], 1)) for one in (std, force_std))
         if not separable:
             std, force_std = std * rng.uniform(0.3, 3, shape), force_std * rng.uniform(0.3, 3, push)
         test = dataclasses.replace(clean, response_std=std, force_std=force_std)
@@ -217,7 +220,8 @@ class TestAgainstTheDenseJacobian:
         weights = []
         for part in (std, force_std):
             log = np.log(part)
-            fitted = log.mean(axis=(0, 2), keepdims=True) + log.mean(axis=1, keepdims=True) - log.mean()
+            of_run = log.mean(axis=(1, 2), keepdims=True)
+            fitted = log.mean(axis=2, keepdims=True) + log.mean(axis=1, keepdims=True) - of_run
             weights.append(np.exp(-fitted).ravel())
         expected = dense.stds(dense.covariance(np.tile(np.concatenate(weights), 2)))
         check(u, expected, FREE)

@@ -41,6 +41,34 @@ def test_modes_of_exact_spectra_are_those_of_the_structure(force):
     assert not modal.by_modes and modal.fit is not None and not modal.lacking
 
 
+def test_the_fit_stands_still_in_the_weights_that_channels_have_in_each_run():
+    """Half the fall of chi² that a Gauss-Newton step from it promises, its Jacobian by differences."""
+    truth, rng = random_structure(11, n=4, d=2), np.random.default_rng(5)
+    clean = sysid.simulate(truth, frequency_lines(truth, 150))
+    base = np.einsum("re,edf->rdf", np.array([[1.0, 0.2], [-0.3, 1.0], [0.6, 0.7]]), clean.base)
+    response = np.einsum("re,enf->rnf", base[:, :, 0], clean.response)
+    std = 0.01 * rng.uniform(0.2, 5.0, (3, 4, 1)) * np.abs(response).mean()
+    noise = rng.normal(size=(2, *response.shape)) * std / np.sqrt(2)
+    test = replace(clean, base=base, response=response + noise[0] + 1j * noise[1], response_std=std)
+    modal = fitted(test)
+    m, w, w_k = modal.omega.size, 2 * np.pi * test.freq, modal.omega[:, None]
+    assert m == 4
+
+    def errors(x):
+        phi, gamma, poles = np.split(x, [4 * m, 6 * m])
+        shift, loss = poles.reshape(2, m, 1)
+        at, ratios = w_k * np.exp(shift * modal.ratios[:, None]), modal.ratios[:, None] * np.exp(loss)
+        q = w**2 / (at**2 - w**2 + 2j * ratios * at * w) * np.einsum("kd,rdf->rkf", gamma.reshape(m, 2), base)
+        left = ((test.relative - np.einsum("nk,rkf->rnf", phi.reshape(4, m), q)) / std).ravel()
+        return np.concatenate([left.real, left.imag])
+
+    x = np.concatenate([modal.phi.ravel(), modal.gamma.ravel(), np.zeros(2 * m)])
+    steps = 1e-5 * np.diag(np.where(x == 0, 1.0, np.abs(x)))
+    J, left = np.array([errors(x + h) - errors(x - h) for h in steps]).T, errors(x)
+    assert np.linalg.norm(J @ np.linalg.lstsq(J, left, rcond=1e-9)[0]) < 1e-4
+    assert np.sum(left**2) == pytest.approx(left.size / 2, rel=0.1)
+
+
 def test_fewer_modes_are_those_that_the_records_feel_most():
     truth = random_structure(11, n=5, d=2)
     test = sysid.simulate(truth, frequency_lines(truth), noise=0.01, rng=3)

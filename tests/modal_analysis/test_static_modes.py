@@ -181,6 +181,20 @@ def test_poles_that_stood_for_modes_above_the_lines_go():
     assert result.structure.n == truth.count == 5 and result.structure.residual.static == 3 and result.determined
 
 
+def test_a_pole_that_noise_explains_once_they_are_there_is_no_mode():
+    """Eight modes in the lines of a plate; of ten poles two are above the eighth, one of them in the lines."""
+    truth = continuous_structure(56)
+    result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
+    assert result.structure.n == truth.count == 8 and result.structure.residual.static == 1 and result.determined
+
+
+def test_a_pole_dragged_to_no_damping_answers_for_one_line_and_is_no_mode():
+    """Six modes in the lines of a beam in space; a seventh pole there keeps the fit from its end."""
+    truth = continuous_structure(18)
+    result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
+    assert result.success and result.structure.n == truth.count == 6
+
+
 def test_more_mass_than_is_spare_is_taken_off_static_modes_without_harm_to_the_accelerations():
     """Whole records of a plate, whose likeliest static modes would leave the base a negative mass."""
     truth = continuous_structure(41)

@@ -1,5 +1,6 @@
 """The program in modal coordinates: its derivatives against CasADi's own, its gauges, and where it ends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -27,7 +28,8 @@ def modes_of(structure):
 def trial(rng, structure, *, force=False, general=False, noise=0.0, stated=False, lines=40):
     """A test of `structure`: unit runs, or two more runs than directions, of any motion; noise relative.
 
-    With `stated` deviations, of other lines for the force than for the motion: the harder case.
+    With `stated` deviations, of other lines for the force than for the motion: the harder case; or of channels that
+    weigh otherwise in each run.
     """
     f, n, d = structure.natural_frequencies, structure.n_sensors, structure.n_base
     freq = np.geomspace(0.6 * f[0], 1.3 * f[-1], lines)
@@ -36,7 +38,8 @@ def trial(rng, structure, *, force=False, general=False, noise=0.0, stated=False
     response = np.einsum("sdf,rdf->rsf", structure.transmissibility(freq), base)
     pull = np.einsum("edf,rdf->ref", structure.base_force(freq), base)
     response, pull = (r + noise * np.sqrt(np.mean(np.abs(r) ** 2) / 2) * normal(*r.shape) for r in (response, pull))
-    std, force_std = (rng.uniform(0.3, 3, (channels, 1)) * rng.uniform(0.3, 3, lines) for channels in (n, d))
+    runs = [len(base)] * (stated == "by run")
+    std, force_std = (rng.uniform(0.3, 3, (*runs, channels, 1)) * rng.uniform(0.3, 3, lines) for channels in (n, d))
     return Measurement(
         freq, base, response, rigid_body=structure.rigid_body, force=pull if force else None,
         response_std=std if stated else None, force_std=force_std if stated and force else None,
@@ -82,7 +85,7 @@ def graph(test, structure):
 
     return SimpleNamespace(
         test=test, z=z.z, start=np.concatenate(z.start), error=error, modes=(gamma, omega, ratios, rigid), model=model,
-        derivatives=derivatives, numbers=numbers, of_theta=of_theta,
+        derivatives=derivatives, numbers=numbers, of_theta=of_theta, weights=weights,
     )  # fmt: skip
 
 
@@ -91,6 +94,7 @@ def graph(test, structure):
     [
         (1, False, False, False), (2, False, False, True), (3, False, True, False), (2, False, True, True),
         (1, True, False, True), (2, True, False, False), (2, True, True, True), (3, True, True, False),
+        (2, True, True, "by run"), (2, False, False, "by run"), (3, True, False, "by run"),
     ],
 )  # fmt: skip
 class TestDerivatives:
@@ -124,7 +128,7 @@ class TestDerivatives:
         if test.force is not None:
             miss = np.einsum("kd,rkf->rdf", gamma, q) + np.einsum("de,ref->rdf", rigid, test.base) - test.force
             if test.force_std is None:
-                expected += np.sum(np.abs(np.asarray(made.error.force_channel) * miss) ** 2)
+                expected += np.sum(np.abs(made.weights.force[..., None] * miss) ** 2)
             else:
                 expected += np.sum(np.abs(miss / test.force_std) ** 2) / size
         assert value.item() == pytest.approx(expected, rel=1e-9)
@@ -142,14 +146,17 @@ class TestDerivatives:
     def test_normal_matrix_is_that_of_kaufmans_jacobian(self, made, d):
         """Slopes of the motions times the shapes, less what other shapes could answer; the whole slope of the force."""
         theta, q = made.error.theta(), made.error.q
-        shapes, values, at = made.numbers(made.at, made.error.shapes, q, theta)
+        shapes, values, at = made.numbers(made.at, made.error.phi, q, theta)
         by_z = [made.numbers(made.at, ca.jacobian(what, made.z))[0] for what in (ca.vec(q), theta)]
         # All unknowns move theta alone, as many of them as it has entries.
         slopes = (by_z[0] @ np.linalg.inv(by_z[1])).reshape(*values.shape, -1, order="F")
-        onto = np.linalg.qr(values.T)[0]
-        slopes = slopes - np.einsum("ab,kbz->kaz", onto @ onto.T, slopes)
-        J = np.einsum("nk,kaz->naz", shapes, slopes).reshape(-1, slopes.shape[2])
-        expected = J.T @ J
+        expected = 0.0
+        for shape, weights in zip(shapes, made.weights.sensors.T, strict=True):
+            weight = np.tile(np.repeat(weights, made.test.freq.size), 2)
+            onto = np.linalg.qr((values * weight).T)[0]
+            J = weight[:, None] * np.einsum("k,kaz->az", shape, slopes)
+            J = J - onto @ (onto.T @ J)
+            expected = expected + J.T @ J
         if made.test.force is not None:
             (F,) = made.numbers(made.at, ca.jacobian(ca.vec(made.error.force_left), made.z))
             F = F @ np.linalg.inv(by_z[1])
@@ -187,9 +194,9 @@ def test_a_force_whose_deviation_is_not_stated_weighs_by_the_noise_that_it_has(r
     rng = np.random.default_rng(4)
     structure = random_structure(rng, n=4, d=2)
     clean, noisy = (trial(rng, structure, force=True, noise=noise, lines=600) for noise in (0.0, 0.02))
-    error = graph(noisy, structure).error
+    weights = graph(noisy, structure).weights
     motion, pull = (np.std(getattr(noisy, name) - getattr(clean, name)) for name in ("response", "force"))
-    weight = np.asarray(error.force_channel).ravel() * np.linalg.norm(noisy.relative)
+    weight = weights.force * np.linalg.norm(noisy.relative)
     np.testing.assert_allclose(weight, motion / pull, rtol=0.05)
 
 
@@ -297,6 +304,56 @@ def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, s
     remainder = np.linalg.eigvalsh(end.rigid - end.modes.gamma.T @ end.modes.gamma)
     assert remainder[0] > -1e-12
     assert remainder[-1] < 0.02
+
+
+@pytest.mark.parametrize(("d", "force"), [(1, True), (2, False), (3, True)])
+def test_slopes_and_curvatures_by_the_unknowns_of_an_estimate_are_those_of_differences(random_structure, d, force):
+    """As many modes as directions share a pole; with a force each one's largest participation is by its logarithm."""
+    rng = np.random.default_rng(d)
+    structure = random_structure(rng, n=4, d=d)
+    test, first = trial(rng, structure, force=force, noise=0.02), modes_of(structure)
+    pole = np.maximum(np.arange(4) - d + 1, 0)
+    apart = np.unique(pole, return_index=True)[1]
+    first = first._replace(omega=first.omega[apart][pole], ratios=first.ratios[apart][pole])
+    model = SpectraModel(test, weights_at(test, first.omega[apart], first.ratios[apart]), pole)
+    start = model.with_best_shapes(first, structure.rigid_body_mass)
+    p = model.in_gauge(start, np.full(d, 0.7))
+    assert model.chi2(p, model.levels) == pytest.approx(model.chi2(start, model.levels), rel=1e-9)  # of the same fit
+    x = model.pack(p)
+    np.testing.assert_allclose(model.pack(model.unpack(x)), x, rtol=1e-14)
+    chi2 = lambda at: model.chi2(model.unpack(at), model.levels)  # noqa: E731
+    gradient = lambda at: _exact(model, model.unpack(at))[1]  # noqa: E731
+    steps = 1e-6 * np.eye(x.size)
+    by_differences = np.array([chi2(x + h) - chi2(x - h) for h in steps]) / 2e-6
+    curved, slopes = _exact(model, p)
+    np.testing.assert_allclose(-2 * slopes, by_differences, atol=1e-5 * np.abs(by_differences).max())
+    turned = np.array([gradient(x - h) - gradient(x + h) for h in steps]) / 2e-6
+    np.testing.assert_allclose(curved, turned, atol=1e-5 * np.abs(turned).max())
+
+
+def _exact(model, p):
+    """Half the exact Hessian and minus half the gradient by the unknowns, whatever its curvature."""
+    plain, curved = model.slopes(p, model.levels)
+    joined, bend = model.chain(p.modes.gamma.ravel(), plain.gradient)
+    return joined @ curved @ joined.T + bend, joined @ plain.gradient
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_a_mode_to_which_the_force_gives_no_mass_is_no_trouble(random_structure, d):
+    """Of one mode the force is turned, so that less than no mass would fit it: none is the least that there can be."""
+    rng = np.random.default_rng(d)
+    structure = random_structure(rng, n=4, d=d)
+    truth, test = modes_of(structure), trial(rng, structure, force=True, noise=0.003, lines=200)
+    w, one = 2 * np.pi * test.freq, truth.at(np.array([2]))
+    g = w**2 / (one.omega**2 - w**2 + 2j * one.ratios * one.omega * w)
+    of_one = np.einsum("kd,ke,kf,ref->rdf", one.gamma, one.gamma, g[None], test.base)
+    test, monitor = replace(test, force=test.force - 1.05 * of_one), IterationMonitor(None, None)
+    end = fitted(test, near(rng, truth, 0.02), monitor=monitor)
+    assert end.status in SOLVED and len(monitor.curve) < 60
+    mine = int(np.argmin(np.abs(end.modes.omega - one.omega)))
+    assert np.sum(end.modes.gamma[mine] ** 2) < 1e-6 * np.sum(one.gamma**2)
+    whole = residues(truth)
+    np.testing.assert_allclose(residues(end.modes), whole, atol=0.02 * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
