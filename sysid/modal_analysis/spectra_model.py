@@ -110,16 +110,17 @@ class SpectraModel(SpectralModel):
         self._free, self._held = np.ones(self._size, bool), np.zeros(self._size)
         self._largest: NDArray[np.intp] | None = None
 
-    def in_gauge(self, p: Parameters, unit: Array) -> Parameters:
+    def in_gauge(self, p: Parameters, unit: Array, *, by_size: bool) -> Parameters:
         """Parameters in the form of their modes that the unknowns keep from now on; `unit` (d,) of participations.
 
-        With a force the largest participation of each mode is by its logarithm, and the others are over it: a mode that
-        the force gives no mass, towards which shapes grow without end, turns nothing singular on the way.
+        With a force and `by_size`, the largest participation of each mode is by its logarithm, and the others are over
+        it: a mode that the force gives no mass, towards which shapes grow without end, turns nothing singular on the
+        way. But no participation changes its sign on the way, so that a fit begins without.
         """
         gauge, held = held_gauge(p.modes, unit, self.force)
         gamma = gauge * unit
         self._free[: gamma.size] = ~held.ravel()
-        if self.force:
+        if self.force and by_size:
             largest = np.arange(self.m) * self.d + np.argmax(np.abs(gauge), axis=1)
             self._largest, self._sign = np.repeat(largest, self.d), np.sign(gamma.ravel()[largest])
         self._held[: gamma.size] = self._in_units(gamma.ravel())
@@ -142,6 +143,7 @@ class SpectraModel(SpectralModel):
         if self._largest is None:
             return gamma
         sizes = gamma[self._largest]
+        sizes = np.where(sizes == 0, 1.0, sizes)  # of a mode without any, which stays so
         own = self._largest == np.arange(gamma.size)
         return np.where(own, np.log(np.abs(sizes)), gamma / sizes)
 
@@ -348,8 +350,9 @@ def fit_spectra(
     # Far below the noise, so that IPOPT finds its tolerance met where it begins.
     enough = lambda chi2: _SETTLED * (chi2 + _SETTLED)  # noqa: E731
     p, settled = model.with_best_shapes(first, rigid), False
-    for _ in range(0, max_iterations, _ROUND):
-        p = model.in_gauge(p, unit)  # anew, as what was largest of modes at one pole may have become next to nothing
+    for done in range(0, max_iterations, _ROUND):
+        # Anew, as what was largest of modes at one pole may have become next to nothing.
+        p = model.in_gauge(p, unit, by_size=done > 0)
         problem = SumOfSquares(
             model.pack(p), model.unpack, lambda p: model.trial_chi2(p, model.levels),
             lambda p: model.normal_equations(p, model.levels),

@@ -102,9 +102,8 @@ def _find(records: Records, progress: _Progress) -> Poles:
     wanted, most = _count(records, progress), _most_poles(records)
     # Where lines are few a spare pole or two must do.
     count = min(wanted, most) if most > wanted - _SPARE else wanted
-    found: tuple[Array, Array] = (np.empty(0), np.empty(0))
     while count <= most:
-        found = omega, ratios = _search(records, count, found, progress)
+        omega, ratios = _search(records, count, progress)
         if omega.size <= count - (_SPARE // 2 if count >= wanted else 1):
             break
         count += max(count // 2, _SPARE)  # too few were spare
@@ -237,8 +236,8 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
     return _prune(records, omega, ratios, progress, velocity=True)
 
 
-def _search(records: Records, count: int, before: tuple[Array, Array], progress: _Progress) -> tuple[Array, Array]:
-    """Poles that stand out of the noise, from `count` that are spread over the lines; and of those found `before`."""
+def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
+    """Poles that stand out of the noise, from `count` that are spread over the lines."""
     first = _relocated(records, count, progress)
     poles = _settled(records, *first, progress)
     if poles[0].size == 0:
@@ -247,8 +246,7 @@ def _search(records: Records, count: int, before: tuple[Array, Array], progress:
     if _is_exact(records, by_velocity) and not _is_exact(records, records.fit(*poles).squared_error):
         return _settled(records, *first, progress, velocity=True)  # records without noise, of other damping: no others
     most = poles[0].size + count
-    tried = np.append(first[0], before[0]), np.append(first[1], before[1])
-    while poles[0].size < most and (more := _with_another(records, *poles, tried, progress)):
+    while poles[0].size < most and (more := _with_another(records, *poles, progress)):
         poles = more
     poles = _merged(records, *poles, progress)
     criterion = _criterion(records, poles, velocity=False)
@@ -303,15 +301,12 @@ def _settled(
     return omega, ratios
 
 
-def _with_another(
-    records: Records, omega: Array, ratios: Array, first: tuple[Array, Array], progress: _Progress
-) -> tuple[Array, Array] | None:
+def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
     Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
-    where most is left, as they may have cost another its pole; then those that there were at `first`, of which one may
-    have gone while others were not in their places. Damping that is not classical needs no pole: one more must fit what
-    the velocities of the poles cannot, or more than they all can.
+    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
+    must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
@@ -320,27 +315,25 @@ def _with_another(
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
-    at = np.concatenate([np.tile(omega, 4) * shift, between, first[0]])
-    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios)), first[1]])
+    at = np.concatenate([np.tile(omega, 4) * shift, between])
+    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
-    least, usual = _least_gain(without_velocity), np.arange(at.size) < at.size - first[0].size
-    tried, gains = -1, []
-    for fit in (with_velocity, without_velocity):
+    least = _least_gain(without_velocity)
+    tried = -1
+    for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
         progress.tell()
         trial, products = fit.beside(plain)
         left = trial.squares()
         gain = np.sum(products**2, axis=1) / np.where(left > least_left, left, np.inf)
-        gains.append(gain.reshape(at.size, -1).sum(axis=1) / _noise(records, fit, omega.size))
-    for among in (usual, ~usual):
-        for gain, to_beat in zip(gains, (np.inf, with_velocity.squared_error), strict=True):
-            best = int(np.argmax(np.where(among, gain, 0.0)))
-            if best == tried or not among[best] or gain[best] <= least:
-                continue
-            tried = best
-            more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-            if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
-                return more
+        gain = gain.reshape(at.size, -1).sum(axis=1)
+        best = int(np.argmax(gain))
+        if best == tried or gain[best] <= least * _noise(records, fit, omega.size):
+            continue
+        tried = best
+        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
+        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+            return more
     return None
 
 

@@ -96,6 +96,7 @@ def solve_modes(
     sizes = ca.MX.ones(m)
     if weighed:  # by its logarithm, so that a mode that the force gives no mass turns nothing singular on the way
         largest = np.max(np.abs(gauge), axis=1, keepdims=True)
+        largest[largest == 0] = 1.0  # of a mode without any, which stays so
         gauge = gauge / largest
         held = held | (np.arange(d) == np.argmax(np.abs(gauge), axis=1)[:, None])
         sizes = ca.exp(z.variable("size of participation", np.log(largest[:, 0])))

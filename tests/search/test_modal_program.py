@@ -317,7 +317,7 @@ def test_slopes_and_curvatures_by_the_unknowns_of_an_estimate_are_those_of_diffe
     first = first._replace(omega=first.omega[apart][pole], ratios=first.ratios[apart][pole])
     model = SpectraModel(test, weights_at(test, first.omega[apart], first.ratios[apart]), pole)
     start = model.with_best_shapes(first, structure.rigid_body_mass)
-    p = model.in_gauge(start, np.full(d, 0.7))
+    p = model.in_gauge(start, np.full(d, 0.7), by_size=True)
     assert model.chi2(p, model.levels) == pytest.approx(model.chi2(start, model.levels), rel=1e-9)  # of the same fit
     x = model.pack(p)
     np.testing.assert_allclose(model.pack(model.unpack(x)), x, rtol=1e-14)
