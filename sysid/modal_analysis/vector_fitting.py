@@ -30,6 +30,7 @@ GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
+_OF_GAIN = 0.1  # of the records' power, that a wrong gain explains at most
 BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
 
 
@@ -112,9 +113,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
     lines = 2 * np.pi * records.freq[records.freq > 0]
     below = omega < lines[0]
-    if np.any(below):
-        below &= _of_one_sensor(records, omega, ratios)
-    if np.any(below):  # a sensor's wrong gain, no mode
+    if np.any(below) and np.any(below := below & _of_one_sensor(records, omega, ratios)):  # a sensor's wrong gain
         omega, ratios = _settled(records, omega[~below], ratios[~below], progress)
     if not np.any((omega > (1 - BESIDE) * lines[0]) & (omega < (1 + BESIDE) * lines[-1])):
         raise InputError(
@@ -130,7 +129,9 @@ def _of_one_sensor(records: Records, omega: Array, ratios: Array) -> NDArray[np.
     worth = np.sum(fit.whitened.reshape(omega.size, -1, n) ** 2, axis=1)
     others = np.sum(worth, axis=1) - np.max(worth, axis=1)
     freedom = fit.residues[0].size * (n - 1) / n
-    return np.asarray(others < _noise(records, fit, omega.size) * beyond_chance(freedom, CANDIDATES)) & (n > 1)
+    chance = _noise(records, fit, omega.size) * beyond_chance(freedom, CANDIDATES)
+    # What explains most of the records is a mode, and beside another that has no pole yet chance is taken for too much.
+    return np.asarray((others < chance) & (fit.gain < _OF_GAIN * records.size)) & (n > 1)
 
 
 def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monitor | None = None) -> Poles:
