@@ -158,7 +158,6 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     fit = records.fit(found, ratios)
     # By its place, or by what the fit would lose without it.
     lacking = (off > np.log1p(window)) | (fit.gain < _least_gain(fit) * _noise(records, fit, found.size))
-    lacking |= ~_may_be_modes(records, found, ratios)
     if np.any(lacking):
         stated, ends = (
             ", ".join(f"{value:.5g}" for value in values[lacking] / (2 * np.pi)) for values in (distinct, found)
@@ -297,7 +296,7 @@ def _settled(
     size = omega.size + 1
     while 0 < omega.size < size:
         size = omega.size
-        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity)
+        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity, until_lost=not velocity)
         omega, ratios = _prune(records, omega, ratios, progress, velocity=velocity)
     return omega, ratios
 
@@ -400,12 +399,13 @@ def _lost(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
 
 
 def _polish(
-    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
-) -> tuple[Array, Array]:
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False,
+    until_lost: bool = False, steps: int = 100,
+) -> tuple[Array, Array]:  # fmt: skip
     """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated.
 
-    It ends where a pole within the lines can be no mode any more: it is to go before the others are worth polishing.
-    From beyond the lines poles come back.
+    With `until_lost` it ends where a pole within the lines can be no mode any more: it is to go before the others are
+    worth polishing. From beyond the lines poles come back.
     """
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
@@ -426,7 +426,7 @@ def _polish(
         other = records.fit(*_poles(trial), velocity=velocity)
         if other.squared_error < error:
             p, fit, damping = trial, other, max(damping / 10, 1e-12)
-            if error - fit.squared_error < NEGLIGIBLE * error or np.any(_lost(records, *_poles(p))):
+            if error - fit.squared_error < NEGLIGIBLE * error or (until_lost and np.any(_lost(records, *_poles(p)))):
                 break
             H, slope = _projected(records, p, fit, velocity)
             failed = np.array(np.inf)

@@ -321,7 +321,7 @@ def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: Iterati
     if not modal.by_modes:
         modal = problem.fit_lines(poles, _modes_asked(problem, options), monitor, options.max_iterations)
         if modal.fit is None:
-            raise DoesNotApplyError(modal.lacking)
+            raise DoesNotApplyError(modal.lacking + _without_pole(problem, poles))
         return modal.fit
     residual = residual_of(modal, modal.modes)
     return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "", static=modal.static)
@@ -435,6 +435,17 @@ def held_by_model(problem: Prepared, structure: Structure) -> Array:
     )  # fmt: skip
     x[formulation.parts.stiffness] = formulation.models[1].values(problem.geometry, near)
     return x
+
+
+def _without_pole(problem: Prepared, poles: Poles) -> str:
+    """Stated frequencies of which another is nearer to their pole, to be added to a refusal; nothing where none is."""
+    stated = 2 * np.pi * np.sort(problem.stated.frequencies)
+    off = np.abs(np.log(poles.omega / stated[:, None]))
+    nearest = off.argmin(axis=1)
+    lacking = [f for k, f in enumerate(stated / (2 * np.pi)) if off[:, nearest[k]].argmin() != k]
+    each = ", ".join(f"{f:.5g}" for f in lacking)
+    does_not = f": of the stated natural frequencies {each} Hz does not stand out, as the base may not move this mode"
+    return does_not * bool(lacking)
 
 
 def poles_of(problem: Prepared) -> Poles:
