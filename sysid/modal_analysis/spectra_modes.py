@@ -113,9 +113,11 @@ class ModeFit:
         Modes of rank one may have dragged a pole to where noise explains it: it is left out.
         """
         best = self._best_at_all()
+        if not self._goes_on or best.of_accelerations <= EXACT:
+            return best
         omega, ratios = _poles_of(best)
         kept = worthwhile(self.records, omega, ratios)
-        if not self._goes_on or best.of_accelerations <= EXACT or kept.size in (0, omega.size):
+        if kept.size in (0, omega.size):
             return best
         return replace(self, poles=replace(self.poles, omega=omega[kept], ratios=ratios[kept])).best()
 
@@ -330,9 +332,11 @@ class ModeFit:
 
         Where it is `pruned`, without modes that were taken for some by the other weights.
         """
+        if self.records.unit or not self._goes_on:
+            return best
         own = weights_at(self.test, *_poles_of(best))
         every = own.sensors if own.force is None else np.hstack([own.sensors, own.force])
-        if self.records.unit or not self._goes_on or np.allclose(every, every[0], rtol=ROUND_OFF, atol=0.0):
+        if np.allclose(every, every[0], rtol=ROUND_OFF, atol=0.0):
             return best
         best = self._from(best.modes, best.rigid, best.static, together=False)
         least = beyond_chance(self.test.n_sensors + self.test.n_base + 1, CANDIDATES)
