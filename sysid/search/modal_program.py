@@ -207,9 +207,8 @@ class _Sensors:
     def __init__(
         self, q: ca.MX, target: Array, over: Array, sensors: NDArray[np.intp], weights: Array
     ) -> None:  # fmt: skip
-        self.sensors, by_run = sensors, np.any(over != 1)
-        every = ca.DM(np.repeat(over, q.size1(), axis=0))
-        motions = every * q if by_run else q
+        weighed = lambda x: ca.DM(np.repeat(over, q.size1(), axis=0)) * x if np.any(over != 1) else x  # noqa: E731
+        self.sensors, motions = sensors, weighed(q)
         # Rows of very different size would spoil the solve.
         scale = ca.sqrt(ca.sum2(motions**2))
         scaled = motions / ca.repmat(scale, 1, q.size2())
@@ -218,9 +217,7 @@ class _Sensors:
         shapes = (ca.solve(normal, product(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, sensors.size)).T
         self.left = ca.DM(target) - product(shapes, motions)
         self.phi = ca.diag(ca.DM(1 / weights)) @ shapes
-        self.pull = -2 * product(shapes.T, self.left)
-        if by_run:
-            self.pull *= every
+        self.pull = weighed(-2 * product(shapes.T, self.left))
 
 
 class EstimateResidual:
