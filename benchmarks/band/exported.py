@@ -33,11 +33,8 @@ STRUCTURES, PATIENCE = 12, 120  # s of processor time each
 SHORT, SHORT_PATIENCE = (7,), 20  # one that takes few seconds
 BEYOND = 1.2  # of the last line, up to where files must answer as the structure does
 SAME, DIGITS, OF_TEXT = 1e-6, 1e-8, 1e-5  # base drive; entries of DMIG; universal files, of six digits
-IN_TIME, PERIODS, END = (
-    1e-3,
-    30,
-    10,
-)  # of the rms; of the first mode; samples at either end, where splines are less exact
+IN_TIME, PERIODS = 1e-3, 30  # of the rms; of the first mode
+END = 10  # samples at either end, where splines are less exact
 RATE, FACTOR = 5.0, 40  # samples a period of the last line; steps of the integrator a sample
 NOISE = 1.2  # what the superelement leaves of the test, over its noise
 DRIVE, GAP = 0.02, 0.25  # of the truth; of the way to the next mode, just beyond the band
@@ -124,7 +121,8 @@ def case(number: int) -> dict:
             figures |= {"op4": _off(taken.driven(freq), right), "dmig": _off(written.driven(freq), right)}
             figures |= {"dmig digits": max(digits)} | _by_pynastran(where, s.n_base, freq, right)
         else:
-            form, order = s.to_craig_bampton(), np.roll(np.arange(len(s.to_craig_bampton().mass)), s.n_base)
+            form = s.to_craig_bampton()
+            order = np.roll(np.arange(len(form.mass)), s.n_base)
             at = np.ix_(order, order)
             taken = Superelement(form.mass[at], form.damping[at], form.stiffness[at], form.recovery[:, order], s.n_base)
         if importlib.util.find_spec("pyuff"):

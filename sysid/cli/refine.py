@@ -25,6 +25,7 @@ from sysid.jobs.minima import Minimum, Spread, as_good, distinct, spreads
 from sysid.jobs.score import DECISIVE, Compared, Move, moves, scored
 from sysid.jobs.submission import FILE_NAME as LEDGER
 from sysid.jobs.submission import submit
+from sysid.modal_analysis.modal_fit import too_few
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe, load
@@ -304,7 +305,7 @@ def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], 
     prepared = problem.prepared.screened
     found = int(np.count_nonzero(prepared.of_structure(poles_of(prepared).omega)))
     if low > found:
-        raise InputError(f"{found} modes stand out of the noise, fewer than the {low} asked for")
+        raise InputError(too_few(found, low))
     return changes[: found + 1 - low], kind if high <= found else f"{kind}: no more than {found} stand out of the noise"
 
 

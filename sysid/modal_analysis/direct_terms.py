@@ -188,7 +188,7 @@ class _AtPoles:
         """Relative residual."""
         return float(np.linalg.norm(self.left) / np.sqrt(self.records.size))
 
-    @property
+    @cached_property
     def spikes(self) -> NDArray[np.bool_]:
         """Lines (n_freq,) that are far off."""
         return _spikes(self.records, self.left)

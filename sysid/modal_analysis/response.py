@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import products, separable
+from sysid.measurement.whole import factors_of_runs, separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
@@ -152,10 +152,8 @@ def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, f
 
 def weights_of_numbers(std: Array | None, shape: tuple[int, int, int]) -> Array:
     """Weights of a record's numbers, `products` of channels and lines, as `columns` has them."""
-    every = np.empty((shape[1], shape[0], shape[2]))
-    for runs, channel, line in products(std, shape):
-        every[:, runs] = channel[:, None, None] * line
-    return every.reshape(shape[1], -1)
+    channel, line = factors_of_runs(std, shape)
+    return (channel.T[..., None] * line).reshape(shape[1], -1)
 
 
 def weights_of(record: ComplexArray, std: Array | None) -> tuple[Array, float]:

@@ -190,12 +190,11 @@ class ModeFit:
         records = self.records
         if best.of_accelerations <= EXACT:
             return False
-        free = records.fit(*_poles_of(best))
+        free, noise = self._free_residues(*_poles_of(best))
         rise = modes_above(self.test.freq, self.test.freq[-1])[:1]
         beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
         rising = records.basis(rise + 0j)
         along = np.linalg.qr(rising - beside @ (beside.T @ rising))[0].T @ free.left
-        noise = records.noise(free.left, free.residues.size)
         return bool(np.sum(along**2) > noise * beyond_chance(along.size))
 
     def at_strongest(self, count: int, inside: NDArray[np.bool_]) -> tuple[ModeFit, NDArray[np.bool_], Integers]:
@@ -359,10 +358,8 @@ class ModeFit:
 
     def _variance(self, best: ModalFit) -> float:
         """Share of one real number of the records in what a fit leaves, as it affects smooth functions."""
-        records, test = self.records, self.test
-        free = records.fit(*_poles_of(best))
-        unknowns = free.residues.size
-        shared = records.noise(free.left, unknowns) / records.variance(float(np.sum(free.left**2)), unknowns)
+        test, (free, noise) = self.test, self._free_residues(*_poles_of(best))
+        shared = noise / self.records.variance(float(np.sum(free.left**2)), free.residues.size)
         numbers = 2 * (test.response.size + (0 if test.force is None else test.force.size))
         unknowns = best.modes.omega.size * (test.n_sensors + test.n_base + 1)
         return shared * best.residual**2 / max(numbers - unknowns, 1)

@@ -438,14 +438,12 @@ def held_by_model(problem: Prepared, structure: Structure) -> Array:
 
 
 def _without_pole(problem: Prepared, poles: Poles) -> str:
-    """Stated frequencies of which another is nearer to their pole, to be added to a refusal; nothing where none is."""
-    stated = 2 * np.pi * np.sort(problem.stated.frequencies)
-    off = np.abs(np.log(poles.omega / stated[:, None]))
-    nearest = off.argmin(axis=1)
-    lacking = [f for k, f in enumerate(stated / (2 * np.pi)) if off[:, nearest[k]].argmin() != k]
+    """Stated frequencies that have no pole of their own, to be added to a refusal; nothing where none is."""
+    stated, ends = 2 * np.pi * problem.stated.frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
+    lacking = stated[~modes_within(stated, ends, poles.omega, FREQUENCY_WINDOW)] / (2 * np.pi)
     each = ", ".join(f"{f:.5g}" for f in lacking)
     does_not = f": of the stated natural frequencies {each} Hz does not stand out, as the base may not move this mode"
-    return does_not * bool(lacking)
+    return does_not * bool(lacking.size)
 
 
 def poles_of(problem: Prepared) -> Poles:
