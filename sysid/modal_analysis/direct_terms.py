@@ -23,7 +23,7 @@ from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, 
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
+from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus, round_off
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
@@ -95,13 +95,26 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     )
 
 
-def _relocated(still: Measurement) -> _AtPoles | None:
-    """Fit of the accelerations; None where the base moves in too few directions, or no pole is found."""
+def _relocated(still: Measurement, steps: int = 8) -> _AtPoles | None:
+    """Fit of the accelerations; None where the base moves in too few directions, or no pole is found.
+
+    No pole is removed for explaining no more than noise. They are looked for in the principal channels, the first half
+    of the steps in few of them, which is quicker; records without noise tell them in the first step.
+    """
     records = Records(still)
-    if not records.unit and records.driven < still.n_base:
+    start = _start(records)
+    if start is None or (not records.unit and records.driven < still.n_base):
         return None
-    poles = _poles(records)
-    return None if poles is None else _AtPoles(records, np.log(poles).ravel())
+    omega, ratios = start
+    first, every = records.principal(4), records.principal(12)
+    direct = _without_poles(records.freq)
+    for step in range(steps):
+        omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
+        if step in (0, steps - 1):
+            at = _at(records, omega, ratios)
+            if at is not None and at.misfit < round_off(len(records.data)):
+                break
+    return at
 
 
 def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
@@ -121,25 +134,20 @@ def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
     return best
 
 
-def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
-    """Poles of the records beside terms without them; none is removed for explaining no more than noise.
-
-    They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
-    """
+def _start(records: Records) -> tuple[Array, Array] | None:
+    """Poles spread over the lines; None where these are too few for one."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
-    inputs = records.base.shape[0]
-    room = (records.data.shape[0] // 3 // inputs - 3) // 2  # three real numbers of a channel for each function
+    room = (records.data.shape[0] // 3 // records.base.shape[0] - 3) // 2  # three real numbers of a channel a function
     count = min(records.n_sensors + _SPARE, _MOST, room)
-    if count < 1:
-        return None
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
-    first, every = records.principal(4), records.principal(12)
-    direct = _without_poles(records.freq)
-    for step in range(steps):
-        omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
+    return (np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)) if count > 0 else None
+
+
+def _at(records: Records, omega: Array, ratios: Array) -> _AtPoles | None:
+    """The fit on those poles that can be modes; None where there are none."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
-    return (omega[kept], ratios[kept]) if np.any(kept) else None
+    return _AtPoles(records, np.log([omega[kept], ratios[kept]]).ravel()) if np.any(kept) else None
 
 
 def _without_poles(freq: Array) -> ComplexArray:
