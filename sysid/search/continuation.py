@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import ClassVar
@@ -104,13 +105,12 @@ class _Smoother:
         return replace(term, modal=ModalEstimate.of_lines(wide.test), shift=wide.shift)
 
 
-def smooth_fit(
+def smooth_fits(
     problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
     monitor: Callable[[int, float], object], most: int = 60,
-) -> LocalResult | None:  # fmt: skip
-    """Fit every step from where the one before ended, while there is time, `most` iterations each; None without any."""
+) -> Iterator[LocalResult]:  # fmt: skip
+    """Fit every step from where the one before ended, while there is time, `most` iterations each: all ends."""
     curve: list[float] = []
-    answer = None
     for step in steps:
         if session.is_over:
             break
@@ -123,10 +123,10 @@ def smooth_fit(
         curve += new.curve.tolist()
         if not np.all(np.isfinite(new.x)):
             break
-        answer, x = replace(new, curve=np.array(curve)), new.x
+        yield replace(new, curve=np.array(curve))
+        x = new.x
         if new.stopped is not None:
             break
-    return answer
 
 
 def descend(
@@ -138,7 +138,7 @@ def descend(
 ) -> LocalResult:
     """Fit every step, and at last the records."""
     monitor = session.reporter("local phase")
-    way = smooth_fit(problem, x, steps, session, monitor)
+    way = next(iter(deque(smooth_fits(problem, x, steps, session, monitor), maxlen=1)), None)
     if way is not None and way.stopped is not None:
         return replace(way, curve=np.zeros(0))  # the records have none yet
     at = x if way is None else way.x
@@ -153,7 +153,7 @@ class _Run:
         self.smoother = smoothed_tests(problem, session.preparing)
         self.steps = self.smoother.steps
         self.ends: list[tuple[float, LocalResult]] = []
-        self.ways: list[Array] = []
+        self.ways: list[list[Array]] = []  # where the steps of each start ended
         self.joined = 0  # starts whose way another one has come before
         self.stopped: BaseException | None = None
         self.start_time = session.seconds
@@ -201,17 +201,17 @@ class _Run:
         """One search."""
         problem, session = self.problem, self.session
         try:
-            way = smooth_fit(problem, x, self.steps, session, session.reporter("continuation"))
-            if way is not None and way.stopped is None:
-                if any(apart(problem, way.x, other) < SAME_ANSWER for other in self.ways):
+            answer, course = None, list[Array]()
+            for way in smooth_fits(problem, x, self.steps, session, session.reporter("continuation")):
+                if way.stopped is not None:
+                    answer = replace(way, curve=np.zeros(0))  # the records have none yet
+                elif self._was_at(len(course), x := way.x):
                     session.log("another start comes the same way")
                     self.joined += 1
                     return
-                self.ways.append(way.x)
-                x = way.x
-            if way is not None and way.stopped is not None:
-                answer = replace(way, curve=np.zeros(0))  # the records have none yet
-            else:
+                course.append(x)
+            self.ways.append(course)
+            if answer is None:
                 answer = local.solve_or_read(problem, x, session, monitor=session.reporter("local phase"))
         except InputError as error:
             self.wrong = error
@@ -224,6 +224,10 @@ class _Run:
         session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {objective:.4e}")
         self.ends.append((objective, answer))
         self.stopped = answer.stopped
+
+    def _was_at(self, step: int, x: Array) -> bool:
+        """True where an earlier start was at these unknowns after the same step: what follows is the same."""
+        return any(apart(self.problem, x, way[step]) < SAME_ANSWER for way in self.ways if step < len(way))
 
     def _good(self, objective: float, best: LocalResult) -> bool:
         """True where the data let a structure be hardly better."""
