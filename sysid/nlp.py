@@ -164,16 +164,18 @@ class NonlinearProgram:
         outputs = [OBJECTIVE_SCALE * value, OBJECTIVE_SCALE * slope]
         return ca.Function("gradient", [self.z, ca.MX.sym("p", 0)], outputs, ["x", "p"], ["f", "grad_f_x"])
 
-    def hessian(self, of_objective: ca.MX, *, curved: bool = True) -> ca.Function:
+    def hessian(self, of_objective: ca.MX, *, curved: int | None = None) -> ca.Function:
         """Hessian of the Lagrangian with that of the objective as given, as nlpsol's `hess_lag`.
 
-        That of the constraints is CasADi's own, and left out where they are not to count as `curved`.
+        That of the constraints is CasADi's own: of the first `curved` rows, the others counting as straight; of all
+        where None.
         """
         at, rows = self.z, self.rows
         p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
         hessian = OBJECTIVE_SCALE * factor * of_objective
-        if curved and rows.numel():
-            hessian += ca.hessian(ca.dot(multipliers, rows), at)[0]
+        count = rows.numel() if curved is None else curved
+        if count:
+            hessian += ca.hessian(ca.dot(multipliers[:count], rows[:count]), at)[0]
         return ca.Function(
             "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
             ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, Weights, separate_poles, too_few, weigh
+from sysid.modal_analysis.modal_fit import (
+    STATIC_POLE,
+    ModalFit,
+    Modes,
+    Weights,
+    rank_one,
+    separate_poles,
+    too_few,
+    weigh,
+)
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
 from sysid.modal_analysis.response import modes_above
 from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
@@ -22,6 +31,7 @@ from sysid.structure.thresholds import CANDIDATES, EXACT, ROUND_OFF, beyond_chan
 
 Integers = NDArray[np.intp]
 
+_TRIAL = 60  # iterations of a fit with one more pole above the lines
 _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 
 
@@ -79,6 +89,8 @@ def fit_modes_of_lines(
     if residual:
         found = fit.with_static(found)
     found = fit.with_weights_of_runs(found, pruned=count is None)
+    if residual:
+        found = fit.with_poles_above(found)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
     return replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
@@ -345,6 +357,55 @@ class ModeFit:
                 break
             best = fewer
         return best
+
+    def with_poles_above(self, best: ModalFit) -> ModalFit:
+        """The fit with further poles between the lines and the static modes, while the records ask for one.
+
+        They are no modes, and need not stand out of chance: what they explain pulls at the modes in the lines. Akaike's
+        criterion decides.
+        """
+        test, last = self.test, 2 * np.pi * float(self.test.freq[-1])
+        far, least = STATIC_POLE[0] * last * (1 + ROUND_OFF), 2 * (test.n_sensors + test.n_base + 2)
+        short = replace(self, max_iterations=min(self.max_iterations, _TRIAL))
+        while self._goes_on and best.static and best.of_accelerations > EXACT:
+            omega, ratios = _poles_of(best)
+            inside = np.count_nonzero(omega <= last)
+            if omega.size - 1 - inside >= max(test.n_base, 2):
+                break
+            modes = self._with_mode(best, *self._most_above(omega, ratios))
+            more = short._from(modes, best.rigid, best.static, together=False)
+            stays = (np.count_nonzero(_poles_of(more)[0] <= last) == inside) & np.all(more.modes.omega < far)
+            if (
+                more.status != "settled"
+                or not stays
+                or best.residual**2 - more.residual**2 < least * self._variance(more)
+            ):
+                break
+            best = more
+        return best
+
+    def _most_above(self, omega: Array, ratios: Array) -> tuple[float, float]:
+        """The pole above the lines, below the static modes', that explains most beside others: rad/s and ratio."""
+        last = 2 * np.pi * float(self.test.freq[-1])
+        at, loss = last * np.geomspace(1, STATIC_POLE[0], 20)[1:-1], float(np.median(ratios))
+        trial, products = self.records.fit(omega, ratios).beside(self.records.functions(at, np.full(at.size, loss)))
+        gain = np.sum(products**2, axis=1) / trial.squares()
+        return float(at[np.argmax(gain.reshape(at.size, -1).sum(axis=1))]), loss
+
+    def _with_mode(self, best: ModalFit, omega: float, ratio: float) -> Modes:
+        """Modes of a fit with one more at this pole, before the static ones."""
+        first, before = separate_poles(best.modes)[0], best.modes.omega.size - best.static
+        poles = np.append(best.modes.omega[first], omega), np.append(best.modes.ratios[first], ratio)
+        residue = linear_residues(self.test, *poles)[0][-1:] * self.unit
+        added = rank_one(residue, np.array([omega]), np.array([ratio]), np.linalg.norm(residue, 2, (1, 2)) ** 0.5)
+        modes = Modes(
+            np.insert(best.modes.phi, [before], added.phi, axis=1),
+            np.insert(best.modes.gamma, before, added.gamma / self.unit, axis=0),
+            np.insert(best.modes.omega, before, omega), np.insert(best.modes.ratios, before, ratio),
+        )  # fmt: skip
+        if self.test.force is not None:
+            modes.gamma[before] *= np.sqrt(weigh(self.test, modes)[0][before])
+        return modes
 
     def _without_least(self, best: ModalFit, weights: Weights) -> Modes:
         """Modes of a fit without the one whose loss the records would feel least, all others as they are."""

@@ -317,6 +317,7 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
     at = np.concatenate([np.tile(omega, 4) * shift, between])
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
+    at, loss = at[at > 0], loss[at > 0]
     plain = records.functions(at, loss)
     least_left = NEGLIGIBLE**2 * plain.squares()
     least = _least_gain(without_velocity)

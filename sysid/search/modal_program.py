@@ -58,7 +58,7 @@ class End(NamedTuple):
 
 def solve_modes(
     modal: ModalEstimate, first: Modes, spectrum: Spectrum, *, unit: Array, remainder: Array, ties: Ties | None = None,
-    weights: Weights | None = None, monitor: IterationMonitor, max_iterations: int = 500,
+    weights: Weights | None = None, monitor: IterationMonitor, max_iterations: int = 500, every_rank: bool = False,
 ) -> ModalFit:  # fmt: skip
     """Minimise the weighted squared error of accelerations and, where it was measured, base force.
 
@@ -76,6 +76,9 @@ def solve_modes(
         Equalities between shapes, participations and rigid-body mass.
     weights : Weights, optional
         Those of an estimate that the program goes on from; else by what free residues at the first poles leave.
+    every_rank : bool
+        Let the remainder have any rank from the beginning. Else it keeps the rank that it starts with, which converges
+        at once where modes carry all of a direction's mass, unless the end shows that this is too few.
 
     Raises
     ------
@@ -99,18 +102,20 @@ def solve_modes(
         largest[largest == 0] = 1.0  # of a mode without any, which stays so
         gauge = gauge / largest
         held = held | (np.arange(d) == np.argmax(np.abs(gauge), axis=1)[:, None])
-        sizes = ca.exp(z.variable("size of participation", np.log(largest[:, 0])))
+        size = np.log(largest[:, 0])
+        # Of a mode that has next to no mass, which the force sees by its square, it has nowhere to settle: it stays.
+        stays = size < np.log(NEGLIGIBLE) / 2
+        ends = np.where(stays, size, -np.inf), np.where(stays, size, np.inf)
+        sizes = ca.exp(z.variable("size of participation", size, *ends))
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = ca.diag(sizes) @ z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
     omega, ratios = spectrum(z)
-    rigid = gamma.T @ gamma
+    rigid = in_parts = gamma.T @ gamma
     if weighed:
-        lam, vectors = np.linalg.eigh(remainder / np.outer(unit, unit))
-        # A factor of zero has no slope.
-        root = np.linalg.cholesky((vectors * np.maximum(lam, NEGLIGIBLE * max(1.0, lam[-1]))) @ vectors.T)
-        factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.variable("base mass", triangle_entries(root)), d)
-        rigid = rigid + factor @ factor.T
+        every_rank = every_rank or ties is not None
+        rigid, in_parts = _rigid_mass(z, gamma, first.gamma.T @ first.gamma, remainder, unit, every_rank=every_rank)
+    curved = z.rows.numel()
     error: ModalResidual | EstimateResidual
     if by_lines:
         poles = separate_poles(first)[0]
@@ -121,8 +126,8 @@ def solve_modes(
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
             z.constrain(tie)
-    best, status = z.minimize(error.value, monitor, max_iterations, error.derivatives(z))
-    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value])
+    best, status = z.minimize(error.value, monitor, max_iterations, error.derivatives(z, curved))
+    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, in_parts, error.value])
     try:
         values = [np.asarray(v) for v in end(best)]
         if not all(np.all(np.isfinite(v)) for v in values):
@@ -131,9 +136,64 @@ def solve_modes(
         raise SolverError(f"{m} modes move so much alike that no shapes can be told apart") from None
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     left, (counted, of_all, of_accelerations) = float(np.sqrt(values[5].item())), error.counted(modes, values[4])
+    if weighed and not (every_rank or monitor.is_over) and _lacks_base(error, modes, values[4], unit):
+        left_over = values[4] - modes.gamma.T @ modes.gamma
+        return solve_modes(
+            modal, modes, spectrum, unit=unit, remainder=left_over, weights=weights, monitor=monitor,
+            max_iterations=max_iterations, every_rank=True,
+        )  # fmt: skip
     if abs(counted - left) > EXACT:
         status = f"{status}, but the residual {left:.6g} of its end is {counted:.6g} when counted anew"
     return ModalFit(modes, values[4], of_all, of_accelerations, status, z.on_bounds(best), weights)
+
+
+def _rigid_mass(
+    z: NonlinearProgram, gamma: ca.MX, of_modes: Array, remainder: Array, unit: Array, *, every_rank: bool
+) -> tuple[ca.MX, ca.MX]:
+    """Rigid-body mass (d, d), and what it is held to: that of all modes and a remainder, positive semidefinite.
+
+    The mass is an unknown of its own, as the records tell it far better than the parts that it is the sum of: else
+    IPOPT follows a curved valley, along which one part takes from the other.
+    """
+    d, scale = unit.size, np.outer(unit, unit)
+    root = triangle_entries(_root(remainder / scale, every_rank=every_rank))
+    free = np.where((root == 0) & (not every_rank), 0.0, np.inf)
+    factor = lower_triangle(z.variable("base mass", root, -free, free), d)
+    entries = z.variable("rigid-body mass", triangle_entries((of_modes + remainder) / scale))
+    in_parts = gamma.T @ gamma / ca.DM(scale) + factor @ factor.T
+    z.constrain(entries - lower_entries(in_parts))
+    lower = lower_triangle(entries, d)
+    return ca.DM(scale) * (lower + ca.tril(lower, False).T), ca.DM(scale) * in_parts
+
+
+def _root(remainder: Array, *, every_rank: bool) -> Array:
+    """Lower-triangular factor (d, d) of a mass: columns of zeros behind as many as it has positive eigenvalues.
+
+    With `every_rank` all are of the least size at which a factor has a slope.
+    """
+    lam, vectors = np.linalg.eigh(remainder)
+    least = NEGLIGIBLE * max(1.0, lam[-1])
+    if every_rank:
+        return np.linalg.cholesky((vectors * np.maximum(lam, least)) @ vectors.T)
+    there = lam > least
+    root = np.zeros_like(remainder)
+    root[:, : np.count_nonzero(there)] = np.asarray(
+        np.linalg.qr((vectors[:, there] * np.sqrt(lam[there])).T, mode="r")
+    ).T
+    return root
+
+
+def _lacks_base(error: ModalResidual | EstimateResidual, modes: Modes, rigid: Array, unit: Array) -> bool:
+    """True where base mass in directions that have none would leave less of the force."""
+    lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
+    none = unit[:, None] * vectors[:, lam <= NEGLIGIBLE * max(1.0, lam[-1])]
+    count, left = none.shape[1], error.counted(modes, rigid)[1] ** 2
+    slope = np.zeros((count, count))
+    for i, j in zip(*np.tril_indices(count), strict=True):
+        mass = np.outer(none[:, i], none[:, j]) + np.outer(none[:, j], none[:, i])
+        less, more = (error.counted(modes, rigid + sign * mass)[1] ** 2 for sign in (-1, 1))
+        slope[i, j] = slope[j, i] = (more - less) / 4
+    return bool(count and np.linalg.eigvalsh(slope)[0] < -NEGLIGIBLE * left)
 
 
 class ModalResidual:
@@ -186,9 +246,9 @@ class ModalResidual:
         corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
 
-    def derivatives(self, z: NonlinearProgram) -> dict[str, ca.Function]:
-        """Gradient and Hessian by the unknowns of a program, in IPOPT's scale of the objective."""
-        return _derivatives(z, self, self.hessian)
+    def derivatives(self, z: NonlinearProgram, curved: int) -> dict[str, ca.Function]:
+        """Gradient and Hessian by the unknowns of a program, in IPOPT's scale; so many rows of constraints bend."""
+        return _derivatives(z, self, self.hessian, curved)
 
     def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
         """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""
@@ -253,7 +313,7 @@ class EstimateResidual:
         static = (np.arange(len(self.modal.omega))[:, None] >= len(self.modal.omega) - self.modal.static).astype(float)
         return static * scale + (1 - static) * sign(scale), static * (scale**2 - 1) / 2
 
-    def derivatives(self, z: NonlinearProgram) -> None:
+    def derivatives(self, z: NonlinearProgram, curved: int) -> None:
         """None of its own: CasADi's are as fast."""
 
     def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
@@ -280,16 +340,18 @@ def hessian_of(model: SpectraModel) -> NumpyFunction:
     return NumpyFunction(size, [(size, size), (size, 1)], values)
 
 
-def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction) -> dict[str, ca.Function]:
+def _derivatives(
+    z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction, curved: int = 0
+) -> dict[str, ca.Function]:
     """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()
-    chain, (curved, slope) = ca.jacobian(theta, unknowns), of_theta(theta)
+    chain, (twice, slope) = ca.jacobian(theta, unknowns), of_theta(theta)
     pull = ca.MX.sym("pull", theta.numel())
     bend = ca.substitute(ca.hessian(ca.dot(pull, theta), unknowns)[0], pull, slope)
-    hessian = chain.T @ curved @ chain
+    hessian = chain.T @ twice @ chain
     return {
         "grad_f": z.gradient(error.value, error.gradient(unknowns)),
-        "hess_lag": z.hessian(hessian + bend, curved=False),
+        "hess_lag": z.hessian(hessian + bend, curved=curved),
     }
 
 
