@@ -16,6 +16,7 @@ from typing import Any
 from sysid import catalogue
 from sysid.cli.arguments import TRUST
 from sysid.cli.output import Output, results_folder
+from sysid.cli.read import tell_band
 from sysid.errors import InputError, refuse, shown
 from sysid.files import recorded_test
 from sysid.results.checkpoint import FILE_NAME, Checkpoint, RunRequest
@@ -122,6 +123,14 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
     recorded_test.load(given.module)  # told before anything is made
     return replace(given, module=_MODULE, data=given.module, parameters={**given.parameters, **extra})
+
+
+def tell_excited_band(recipe: Recipe, out: Output) -> None:
+    """Tell the band that the base excites, of a run of records that ``sysid read`` wrote, and whether it is fitted."""
+    if recipe.module == _MODULE and recipe.data is not None:
+        stated = {name for name in ("band", "estimator") if recipe.parameters.get(name) is not None}
+        use = "other lines were asked for" if stated else "these lines are fitted, and --band LOW-HIGH takes others"
+        tell_band(recorded_test.load(recipe.data), use, out)
 
 
 def folder_of(options: argparse.Namespace, out: Output) -> Path:
