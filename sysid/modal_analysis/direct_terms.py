@@ -126,7 +126,7 @@ def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
 
     They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
     """
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     inputs = records.base.shape[0]
     room = (records.data.shape[0] // 3 // inputs - 3) // 2  # three real numbers of a channel for each function
     count = min(records.n_sensors + _SPARE, _MOST, room)
@@ -179,7 +179,7 @@ class _AtPoles:
     def ends(self) -> tuple[Array, Array]:
         """Least and largest log w_k and log zeta_k, (2m,) each."""
         least, most = np.full((2, *self.poles.shape), [[-np.inf], [np.inf]])
-        least[: self.omega.size] = np.log(2 * np.pi * self.records.freq[self.records.freq > 0][0])
+        least[: self.omega.size] = np.log(self.records.lines[0])
         most[self.omega.size :] = np.log(_MODE)
         return least, most
 
@@ -270,7 +270,7 @@ def _shows_below(at: _AtPoles) -> bool:
     records = at.records
     if not inside.all() and inside.any():
         at = _AtPoles(records, at.poles.reshape(2, -1)[:, inside].ravel())
-    tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
+    tail = records.basis(np.maximum(2 * np.pi * records.freq, records.lines[0])[None] ** -2.0 + 0j, records.driven)
     beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
     gained, left = float(np.sum((beyond.T @ at.left) ** 2)), at.left
     noise = records.noise(left, at.count * left.shape[1])
