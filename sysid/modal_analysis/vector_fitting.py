@@ -221,7 +221,7 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
 
     Some `rounds` at most: each moves all of them.
     """
-    omega, ratios = np.geomspace(*records.lines[[0, -1]], count), np.full(count, GUESS)
+    omega, ratios = np.geomspace(records.lines[0], records.lines[-1], count), np.full(count, GUESS)
     progress.tell()
     channels = records.principal(count)
     error = np.inf
