@@ -1,6 +1,7 @@
 """Records of a file are fitted in the band that the base excites, where none is stated."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def test_drift_below_the_band_is_no_mode():
     np.testing.assert_allclose(result.structure.mass[:2, :2], np.diag([3.0, 2.0]), atol=0.05)
 
 
-def test_read_and_run_tell_it_and_spectra_have_none(tmp_path, monkeypatch, capsys, no_pictures):
+def test_read_and_run_tell_it_and_refuse_more_modes_than_stand_out_in_it(tmp_path, monkeypatch, capsys, no_pictures):
     monkeypatch.chdir(tmp_path)
     test = recorded(1.0, 12.0)
     (tmp_path / "test.h5").write_bytes(test.to_bytes())
@@ -68,6 +69,9 @@ def test_read_and_run_tell_it_and_spectra_have_none(tmp_path, monkeypatch, capsy
     assert told("show", "test.h5")["excited_band_hz"] == band
     found = told("run", "test.h5")
     assert found["excited_band_hz"] == found["result"]["band_hz"] == band
+    assert cli.main(["run", "test.h5", "--modes", "3", "--fresh", "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.findall(r"\d+", line) == ["2", "3"]
     found = told("run", "test.h5", "--band", "0.5-15", "--fresh")
     assert found["excited_band_hz"] == band and found["result"]["band_hz"] == pytest.approx([0.5, 15.0])
     spectra = test.measurement()
