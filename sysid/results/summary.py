@@ -177,7 +177,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
         one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
             "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
-            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
+            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * tables.runs_can_be_left_out(it)
         ]
     # A goal is of accelerations: it takes no force for explained.
     if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:

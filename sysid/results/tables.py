@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from sysid.assessment.checks.model_error import LEVEL
 from sysid.assessment.checks.stated import sides_of
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.response import of_residual_modes, residual_share
 from sysid.results.answer import Answer
 from sysid.structure.structure import Array, ComplexArray
@@ -286,6 +287,14 @@ def beyond_lines(it: Answer, test: Measurement) -> str:
     apart = ", ".join(f"{100 * missed / size:.3g} % {name}" for name, missed, size in norms if size > 0)
     words = f"{np.count_nonzero(beyond)} of its {f.size} lines are beyond those that were fitted"
     return f"; {words} ({fitted[0]:.4g} to {fitted[-1]:.4g} Hz)" + f", and missed by {apart}" * bool(apart)
+
+
+def runs_can_be_left_out(it: Answer) -> bool:
+    """True where there are several runs, and the others excite what free matrices need without some one of them."""
+    base = it.measurement.base
+    rank = lambda runs: independent(runs).shape[1]  # noqa: E731
+    kept = (base[np.arange(len(base)) != run] for run in range(len(base)))
+    return len(base) > 1 and (not it.facts.mass_is_free or any(rank(runs) == rank(base) for runs in kept))
 
 
 def in_columns(rows: Iterable[Sequence[str]], left: Collection[int] = ()) -> list[str]:

@@ -51,7 +51,8 @@ def test_masses_of_the_modes_stand_beside_the_rigid_body_mass(answer):
     assert [(row.axis, row.unit, row.one_of_many) for row in rows] == [("x", "kg", False), ("y", "kg", False)]
     np.testing.assert_allclose([row.rigid_body for row in rows], np.diag(s.rigid_body_mass))
     np.testing.assert_allclose([row.in_modes for row in rows], np.sum(s.participation**2, axis=0))
-    assert f"({rows[0].in_modes:.4g} kg in these modes)" in " ".join(answer.summary().split())
+    told = re.findall(r"kg \((\S+) kg", " ".join(answer.summary().split()))
+    assert told == [f"{row.in_modes:.4g}" for row in rows]
 
 
 def test_a_test_that_was_not_fitted_says_how_many_of_its_lines_are_beyond(answer):
@@ -77,4 +78,21 @@ def test_lines_beyond_speak_against_no_answer_in_the_band(answer):
 
 def test_the_page_holds_all_of_it(answer, no_pictures):
     page = report.render(answer)
-    assert "modes beyond [%]" in page and "in these modes" in page and "are beyond those that were fitted" in page
+    row = tables.masses_of_modes(answer)[1]
+    assert re.search(rf"<td>y</td>.*?{row.rigid_body:.4g}.*?{row.in_modes:.4g}", page, re.DOTALL)
+    assert "modes beyond" in page and "of its 300" in page
+
+
+def test_leaving_runs_out_is_proposed_where_the_others_move_the_base_as_all_do(answer):
+    """Each of two runs moves the base in a direction of its own; a third in both makes one of them spare."""
+    assert not tables.runs_can_be_left_out(answer)
+    assert "--leave-out" not in report.render(dataclasses.replace(answer, problem=without_validation(answer.problem)))
+    test = answer.measurement
+    more = [np.concatenate([part, part.sum(axis=0, keepdims=True)]) for part in (test.base, test.response, test.force)]
+    three = sysid.Measurement(test.freq, *more[:2], force=more[2], sensors=test.sensors, rigid_body=test.rigid_body)
+    problem = dataclasses.replace(without_validation(answer.problem), measurement=three)
+    assert tables.runs_can_be_left_out(dataclasses.replace(answer, problem=problem))
+
+
+def without_validation(problem):
+    return dataclasses.replace(problem, validation=())
