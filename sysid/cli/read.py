@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli.output import Output
+from sysid.cli.requests import tell_band
 from sysid.cli.starting import SUCCESS
 from sysid.errors import refuse
 from sysid.files import description, recorded_test
@@ -38,13 +39,6 @@ def tell_channels(test: recorded_test.RecordedTest, out: Output) -> None:
     out.write(f"{test.in_words()}\n")
     out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
     tell_band(test, "the lines that 'sysid run' fits where no --band is given", out)
-
-
-def tell_band(test: recorded_test.RecordedTest, use: str, out: Output) -> None:
-    """Write the band that the base excites, and what it is used for; nothing of spectra."""
-    if (band := test.excited_band) is not None:
-        out.write(f"the base excites {band[0]:.4g} to {band[1]:.4g} Hz: {use}\n")
-        out.answer(excited_band_hz=list(band))
 
 
 def _said(options: argparse.Namespace) -> Any:

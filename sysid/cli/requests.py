@@ -16,7 +16,6 @@ from typing import Any
 from sysid import catalogue
 from sysid.cli.arguments import TRUST
 from sysid.cli.output import Output, results_folder
-from sysid.cli.read import tell_band
 from sysid.errors import InputError, refuse, shown
 from sysid.files import recorded_test
 from sysid.results.checkpoint import FILE_NAME, Checkpoint, RunRequest
@@ -131,6 +130,13 @@ def tell_excited_band(recipe: Recipe, out: Output) -> None:
         stated = {name for name in ("band", "estimator") if recipe.parameters.get(name) is not None}
         use = "other lines were asked for" if stated else "these lines are fitted, and --band LOW-HIGH takes others"
         tell_band(recorded_test.load(recipe.data), use, out)
+
+
+def tell_band(test: recorded_test.RecordedTest, use: str, out: Output) -> None:
+    """Write the band that the base excites, and what it is used for; nothing of spectra."""
+    if (band := test.excited_band) is not None:
+        out.write(f"the base excites {band[0]:.4g} to {band[1]:.4g} Hz: {use}\n")
+        out.answer(excited_band_hz=list(band))
 
 
 def folder_of(options: argparse.Namespace, out: Output) -> Path:
