@@ -13,6 +13,7 @@ from sysid.errors import InputError, SolverError, SysidError
 from sysid.export.export import export
 from sysid.files.reading import read
 from sysid.identify import identify
+from sysid.measurement.excited_band import excited_band
 from sysid.measurement.in_time import TimeScores, time_scores
 from sysid.measurement.measurement import Measurement, Sensor, simulate
 from sysid.measurement.spectra import resample
@@ -68,6 +69,6 @@ __all__ = [
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",
     "SpectralStiffness", "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores",
-    "Totals", "Unknown", "Variable", "__version__", "catalogue", "export", "identify", "jobs", "load",
+    "Totals", "Unknown", "Variable", "__version__", "catalogue", "excited_band", "export", "identify", "jobs", "load",
     "minimize_swarm", "plot", "read", "resample", "rigid_body", "simulate", "time_scores", "write_report",
 ]  # fmt: skip

@@ -187,7 +187,11 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
     )
     run.add_argument("--lumped", action="store_true", default=None, help="of TEST.h5: masses at the sensors alone")
     run.add_argument(
-        "--band", type=_band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
+        "--band",
+        type=_band,
+        metavar="LOW-HIGH",
+        help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40; those that the base excites, of records in "
+        "time, unless given",
     )
     run.add_argument(
         "--goal", type=float, metavar="SHARE",

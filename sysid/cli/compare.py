@@ -14,7 +14,6 @@ from sysid.compare.comparison import Comparison, as_csv, compare, comparison_tex
 from sysid.compare.peers import MethodResult
 from sysid.results.identification import Recipe
 from sysid.results.version import __version__
-from sysid.search.modal import Modal
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
@@ -31,8 +30,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     def tell(result: MethodResult) -> None:
         out.progress(f"{line(result)}\n")
 
-    modal = Modal(recipe.sensors or None, modes=recipe.modes)
-    compared = compare(problem, rng=options.seed, max_time=options.max_time, modal=modal, listener=tell)
+    compared = compare(problem, rng=options.seed, max_time=options.max_time, modal=recipe.modal, listener=tell)
     if not compared.results:
         raise KeyboardInterrupt
     out.write(f"\n{comparison_text(compared)}\n\n")

@@ -143,6 +143,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
         f"{formulation.size} unknowns, seed {search.seed}\n"
     )
+    requests.tell_excited_band(recipe, out)
     out.flush()
     failed: InputError | None = None
     # From the search's end until the result is on the disk Ctrl-C waits, however often.

@@ -206,7 +206,8 @@ SENSORS
 
 
 def problem(*, data=None, rng=0):
-    # 1. The test: its records whole; band=(low, high) in Hz takes some of the lines, estimator="h1" averages them.
+    # 1. The test: its records whole, in the band that the base excites; band=(low, high) in Hz takes other lines,
+    #    estimator="h1" averages them.
     test = recorded_test.load(data or TEST).measurement()
 
     # 2. What is known of the masses: their total, if no base force was measured: sysid.FullMass(1450.0, ...);

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli.output import Output
+from sysid.cli.requests import tell_band
 from sysid.cli.starting import SUCCESS
 from sysid.errors import refuse
 from sysid.files import description, recorded_test
@@ -37,6 +38,7 @@ def tell_channels(test: recorded_test.RecordedTest, out: Output) -> None:
     """Write the channels of a test and what was noticed while it was read."""
     out.write(f"{test.in_words()}\n")
     out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
+    tell_band(test, "the lines that 'sysid run' fits where no --band is given", out)
 
 
 def _said(options: argparse.Namespace) -> Any:

@@ -30,7 +30,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.summary import WIDTH
-from sysid.results.tables import counted, in_columns
+from sysid.results.tables import counted, in_columns, quantities
 from sysid.search.modal import poles_of
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, most_deviations
 
@@ -100,7 +100,8 @@ def _submitted(
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
         word, count, kind = "draw", options.draws, "draw{s} of noise, each fitted from the result"
-        jobs, report = send(_started(recipe, source), draws=count), report_draws
+        by = "modal" if recipe.start is None else ""
+        jobs, report = send(recipe, draws=count, strategy=by), report_draws
     else:
         word, count, kind = "start", options.starts or 16, "start{s}, the first at the result"
         jobs, report = send(_started(recipe, source), starts=count), report_minima
@@ -165,7 +166,7 @@ def _started(recipe: Recipe, source: Path) -> Recipe:
     """The recipe, where it has a start."""
     if recipe.start is None:
         why = "its degrees of freedom are not the sensors, so it has no unknowns to start from"
-        raise InputError(f"{source}: {why}; --leave-out, --bands and --orders need none")
+        raise InputError(f"{source}: {why}; --draws, --leave-out, --bands and --orders need none")
     return recipe
 
 
@@ -196,13 +197,14 @@ def report_minima(folder: Path, result: Identification, recipe: Recipe, ends: li
 
 
 def _as_rows(what: str, ends: list[JobResult], result: Identification, **more: Sequence[object]) -> bytes:
-    """A row an end as CSV, with `more` columns."""
-    rows: list[Sequence[object]] = [
-        (what, "seed", "success", "residual", *more, "message", *result.problem.formulation.labels)
-    ]
+    """A row an end as CSV, with `more` columns; its unknowns, or what an answer without unknowns tells."""
+    told = list(quantities(result)) if result.x is None else []
+    names = told or result.problem.formulation.labels
+    rows: list[Sequence[object]] = [(what, "seed", "success", "residual", *more, "message", *names)]
     for end, *others in zip(ends, *more.values(), strict=True):
         left = repr(end.residual) if end.has_result else ""
-        rows.append((end.index, end.seed, end.success, left, *others, end.message, *map(repr, end.x.tolist())))
+        values = end.x.tolist() if end.score is None else [end.score.values[name] for name in told]
+        rows.append((end.index, end.seed, end.success, left, *others, end.message, *map(repr, values)))
     return table_as_csv(rows)
 
 

@@ -124,6 +124,21 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     return replace(given, module=_MODULE, data=given.module, parameters={**given.parameters, **extra})
 
 
+def tell_excited_band(recipe: Recipe, out: Output) -> None:
+    """Tell the band that the base excites, of a run of records that ``sysid read`` wrote, and whether it is fitted."""
+    if recipe.module == _MODULE and recipe.data is not None:
+        stated = {name for name in ("band", "estimator") if recipe.parameters.get(name) is not None}
+        use = "other lines were asked for" if stated else "these lines are fitted, and --band LOW-HIGH takes others"
+        tell_band(recorded_test.load(recipe.data), use, out)
+
+
+def tell_band(test: recorded_test.RecordedTest, use: str, out: Output) -> None:
+    """Write the band that the base excites, and what it is used for; nothing of spectra."""
+    if (band := test.excited_band) is not None:
+        out.write(f"the base excites {band[0]:.4g} to {band[1]:.4g} Hz: {use}\n")
+        out.answer(excited_band_hz=list(band))
+
+
 def folder_of(options: argparse.Namespace, out: Output) -> Path:
     """The folder of results that the arguments of ``run`` ask for."""
     if options.resume is None:

@@ -41,6 +41,7 @@ def read(
         beside the first file: of its name, or ``sensors.toml``.
     **options
         Of records in time those of `Measurement.from_time`: estimator, band, at_rest, noise, segment. Of spectra: band.
+        Without a band whole records are fitted in that which the base excites (`sysid.excited_band`).
 
     Returns
     -------

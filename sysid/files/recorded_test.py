@@ -13,6 +13,7 @@ import numpy as np
 
 from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
+from sysid.measurement.excited_band import excited_band
 from sysid.measurement.measurement import Measurement
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
@@ -67,12 +68,22 @@ class RecordedTest:
     table: tuple[ChannelRow, ...]
     remarks: tuple[str, ...] = ()
 
+    @property
+    def excited_band(self) -> tuple[float, float] | None:
+        """The band that the base excites, Hz (`sysid.excited_band`); None of spectra."""
+        return None if self.sample_rate is None else excited_band(self.runs, self.sample_rate)
+
     def measurement(self, **options: Any) -> Measurement:
-        """The measurement; `options` are those of `Measurement.from_time`, of spectra ``band`` alone."""
+        """The measurement; `options` are those of `Measurement.from_time`, of spectra ``band`` alone.
+
+        Without a band whole records are fitted in that which the base excites.
+        """
         G = rigid_body(sensors=self.sensors, base_axes=self.base_axes, origin=self.origin)
         given: Any = {"rigid_body": G, "sensors": self.sensors, "base_axes": self.base_axes}
         if self.freq is None:
             assert self.sample_rate is not None
+            if options.get("estimator", "records") == "records" and options.get("band") is None:
+                options["band"] = self.excited_band
             return Measurement.from_time(self.runs, self.sample_rate, **given, **options)
         band = options.pop("band", None)
         if options:

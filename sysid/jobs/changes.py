@@ -225,12 +225,19 @@ def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> Stated
             at = value + std * next(priors).numbers(x)
             again = replace(given, value=at + std * rng.standard_normal(at.size))
         residuals.append(again)
-    structure, modal = problem.structure(x), problem.modal[0]
-    if modal.noise is None:
-        test = _again(modal.records, structure, problem.n_variables, rng)
-    else:
-        test = _whole_again(modal, modal.noise, structure, rng)
+    test = _test_again(problem.modal[0], problem.structure(x), problem.n_variables, rng)
     return replace(problem.stated, measurement=test, residuals=residuals, loss="squares", validation=(), reference=None)
+
+
+def drawn_from(answer: Identification, random: np.random.SeedSequence) -> Problem:
+    """The problem of an answer that tells no unknowns, such as one in the band, with records drawn likewise."""
+    s, modal = answer.structure, answer.modal[0]
+    check_drawable(answer.problem)
+    refuse((answer.problem.loss != "squares", "draws of an answer in the band need loss='squares'"))
+    # A shape and a participation each mode, a frequency and a ratio.
+    unknowns = s.n * (s.n_sensors + s.n_base + 2)
+    test = _test_again(modal, s, unknowns, np.random.default_rng(random))
+    return replace(answer.problem, measurement=test, goal=None, validation=(), reference=None)
 
 
 def check_drawable(problem: StatedProblem) -> None:
@@ -241,6 +248,12 @@ def check_drawable(problem: StatedProblem) -> None:
             "draws of noise need records, and values known to some accuracy (Prior): what noise the misfit or the "
             "residuals have that this problem states for itself is not known"
         )
+
+
+def _test_again(modal: ModalEstimate, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
+    if modal.noise is None:
+        return _again(modal.records, structure, unknowns, rng)
+    return _whole_again(modal, modal.noise, structure, rng)
 
 
 def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -12,8 +13,9 @@ from sysid.assessment.checks.context import Context
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
-from sysid.jobs.changes import Change, NumberOfModes, drawn
+from sysid.jobs.changes import Change, NumberOfModes, drawn, drawn_from
 from sysid.jobs.score import Score, scored
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
@@ -22,6 +24,7 @@ from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
 from sysid.search.auto import robust_fit
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
+from sysid.search.modal import fit_records_as_asked
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -37,7 +40,7 @@ class Job:
     recipe: Recipe
     start: int  # 0 is the recipe's own where it has one; all others are fresh points of the search space
     source: str  # tells what one problem is made from, from another's
-    draw: int = 0  # of noise, from 1; the job then starts where the recipe does. 0 fits the records themselves
+    draw: int = 0  # of noise, from 1; by gradients from where the recipe starts. 0 fits the records themselves
     strategy: str = ""  # by which the problem is identified whole; empty for the local phase alone
     change: Change | None = None  # of the problem that is identified whole
 
@@ -45,9 +48,9 @@ class Job:
     def seed(self) -> int:
         """Of the fresh point or the noise: the recipe's and the number of the start or the draw make it.
 
-        Of a whole identification it is the recipe's.
+        Of a whole identification of the records themselves it is the recipe's.
         """
-        if self.strategy:
+        if self.strategy and not self.draw:
             return self.recipe.rng
         key = (self.start, self.draw) if self.draw else (self.start,)
         return int(np.random.SeedSequence(self.recipe.rng, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)
@@ -129,6 +132,10 @@ def _identified(job: Job, session: Session) -> JobResult:
         asked = replace(job.recipe, sensors=tuple(name for name in job.recipe.sensors if name in there))
         if isinstance(job.change, NumberOfModes):
             asked = replace(asked, modes=job.change.count)
+        if job.draw:
+            answer = _answer(asked, job.source, job.strategy)
+            asked = replace(asked, modes=answer.structure.n)
+            changed = drawn_from(answer, np.random.SeedSequence(job.seed))
         result = identify(changed, strategy=asked.strategy(job.strategy), rng=job.seed)
         if result.interrupted:
             raise KeyboardInterrupt
@@ -156,14 +163,14 @@ def _predicted(problem: Problem, result: Identification, change: Change) -> floa
 
 def _refined(job: Job, session: Session) -> JobResult:
     bare = replace(job.recipe, start=None)
-    problem = _built(bare, job.source).prepared
+    problem = _prepared(bare, job.source)
     from_recipe = job.start == 0 and job.recipe.start is not None
     if from_recipe:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
             fitted = problem if problem.in_squares else problem.pseudo_values(problem.structure(x), x)
-            problem = Prepared(drawn(fitted, x, np.random.SeedSequence(job.seed)))
+            problem = _as_asked(Prepared(drawn(fitted, x, np.random.SeedSequence(job.seed))), bare)
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:
@@ -187,6 +194,25 @@ def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], s
     if end.stopped is not None:
         raise end.stopped
     return end
+
+
+@lru_cache(maxsize=_BUILT)
+def _answer(recipe: Recipe, source: str, strategy: str) -> Identification:
+    """The answer of a recipe, about which noise is drawn, once a worker."""
+    return identify(_built(recipe, source), strategy=recipe.strategy(strategy), rng=recipe.rng)
+
+
+@lru_cache(maxsize=_BUILT)
+def _prepared(recipe: Recipe, source: str) -> Prepared:
+    """The problem with the modes of its records that the recipe asks for, once a worker."""
+    return _as_asked(_built(recipe, source).prepared, recipe)
+
+
+def _as_asked(problem: Prepared, recipe: Recipe) -> Prepared:
+    """The problem, where its matrices follow from modes with those that a recipe asks for, as its identification."""
+    if recipe.modal.refusal(problem, None) is None:
+        fit_records_as_asked(problem, recipe.modal, nullcontext(FitMonitor()))
+    return problem
 
 
 @lru_cache(maxsize=_BUILT)

@@ -118,11 +118,17 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
         raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
     u = result.uncertainty
     stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
-    structures = [result.problem.structure(end.x) for end in found]
-    draws = [quantities(replace(result, x=end.x, structure=s)) for end, s in zip(found, structures, strict=True)]
+    draws = [_quantities(result, end) for end in found]
     rows = []
     for name, value in quantities(result).items():
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
         rows.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
     return rows
+
+
+def _quantities(result: Identification, end: JobResult) -> dict[str, float]:
+    """`quantities` of an end of the problem of a result."""
+    if end.score is not None:
+        return end.score.values
+    return quantities(replace(result, x=end.x, structure=result.problem.structure(end.x)))

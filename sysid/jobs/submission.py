@@ -153,7 +153,8 @@ def submit(
         Of each recipe.
     draws : int
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
-        size that was stated or found, drawn anew for each.
+        size that was stated or found, drawn anew for each. With `strategy`, of an answer that tells no unknowns: whole
+        identifications, of as many modes as the answer of the records themselves.
     changes : sequence of Band, WithoutRun, WithoutSensor, NumberOfModes or None
         In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
     strategy : str
@@ -194,11 +195,12 @@ def submit(
         ),
     )
     starts, draws = whole_number("starts", starts, at_least=1), whole_number("draws", draws, at_least=0)
-    lacking = draws and (starts > 1 or any(one.start is None for one in recipes))
-    refuse((lacking, "draws need Recipe.start, the unknowns that were identified, and exclude starts"))
+    lacking = draws and (starts > 1 or (not strategy and any(one.start is None for one in recipes)))
+    wanted = "draws need Recipe.start, the unknowns that were identified, or a strategy, and exclude starts"
+    refuse((lacking, wanted))
     if changes != ():
         changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor, NumberOfModes or None")
-    by = _strategy(strategy, changes, starts > 1 or draws > 0)
+    by = _strategy(strategy, changes, starts > 1 or (draws > 0 and changes != ()))
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
     jobs: list[Job] = []
@@ -206,10 +208,10 @@ def submit(
     folder = None if out is None else Path(out).absolute()
     for one, source in zip(recipes, _sources(recipes, draws > 0, folder), strict=True):
         rooted = _rooted(one)
-        if by:
+        if draws:
+            jobs += [Job(next(index), rooted, 0, source, draw=k + 1, strategy=by) for k in range(draws)]
+        elif by:
             jobs += [Job(next(index), rooted, 0, source, strategy=by, change=change) for change in changes or (None,)]
-        elif draws:
-            jobs += [Job(next(index), rooted, 0, source, draw=k + 1) for k in range(draws)]
         else:
             jobs += [Job(next(index), rooted, k, source) for k in range(starts)]
     ledger = None if folder is None else Ledger(folder, jobs)
@@ -225,7 +227,7 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
         (wrong, f"changes holds a {', '.join(wrong[:1])}; give Band, WithoutRun, WithoutSensor or NumberOfModes"),
         (
             others and (changes or strategy),
-            "changes and strategy stand for whole identifications, and exclude starts and draws",
+            "changes and strategy stand for whole identifications, and exclude starts, and changes draws",
         ),
         (strategy not in ("", "auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
     )

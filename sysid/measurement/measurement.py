@@ -36,7 +36,6 @@ from sysid.structure.sensor import (
 )
 from sysid.structure.structure import Array, ComplexArray, Structure
 
-_FOLDED = 0.4  # of the sample rate; whole records are fitted up to it
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
 
 
@@ -410,7 +409,7 @@ class Measurement:
             )  # fmt: skip
             test = replace(test, averaged=True)
         if band is None and estimator == "records":
-            band = test.freq[0], max(_FOLDED * sample_rate, test.freq[0])
+            band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
     noise_from_rest = staticmethod(levels_at_rest)

@@ -22,6 +22,8 @@ from sysid.errors import (
 )
 from sysid.structure.structure import Array, ComplexArray
 
+FOLDED = 0.4  # of the sample rate; whole records are fitted up to it
+
 
 class TimeRun(NamedTuple):
     """One run in time: base (d, n), response (n_sensors, n), force (d, n) or None."""
@@ -82,12 +84,27 @@ def check_runs(
     return records
 
 
+def runs_of_records(runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float) -> list[TimeRun]:
+    """Check time records against the first run and each other."""
+    given = sequence("runs", runs, "a list of (base, response, force or None)")
+    base, response, _ = sequence("run 1", given[0], "(base, response, force or None)", 3)
+    shape = tuple(np.atleast_2d(finite_array("run 1", record)).shape[0] for record in (response, base))
+    return check_runs(given, sample_rate, shape)
+
+
 def directions(runs: Any) -> int:
     """Number of directions of the base in the first run, as far as it can be told; `check_runs` looks closer."""
     try:
         return int(np.atleast_2d(np.asarray(runs[0][0])).shape[0])
     except (TypeError, IndexError, KeyError, ValueError):
         return 1
+
+
+def lines_of_record(samples: int) -> Array:
+    """Lines above zero of a whole record, in cycles a sample, (samples // 2,); those of two records alike are equal."""
+    if samples < 2:
+        raise InputError(f"a record of {samples} samples has no spectral line above zero")
+    return np.round(np.arange(1, samples // 2 + 1) / samples, 14)
 
 
 def whole_record(
@@ -99,11 +116,9 @@ def whole_record(
     a run has zeros at the lines of others.
     """
     lengths = sorted({run.base.shape[1] for run in runs})
-    grids = {n: np.arange(1, n // 2 + 1) / n for n in lengths}  # in cycles a sample
-    if lengths[0] < 2:
-        raise InputError(f"a record of {lengths[0]} samples has no spectral line above zero")
-    lines = np.unique(np.round(np.concatenate(list(grids.values())), 14))
-    at = {n: np.searchsorted(lines, np.round(freq, 14)) for n, freq in grids.items()}
+    grids = {n: lines_of_record(n) for n in lengths}
+    lines = np.unique(np.concatenate(list(grids.values())))
+    at = {n: np.searchsorted(lines, freq) for n, freq in grids.items()}
 
     def transform(records: list[Array]) -> ComplexArray:
         out = np.zeros((len(records), len(records[0]), lines.size), complex)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, finite_array, instance, refuse, sequence
-from sysid.measurement.spectra import TimeRun, check_runs, of_run
+from sysid.measurement.spectra import TimeRun, of_run, runs_of_records
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
@@ -293,13 +293,10 @@ def levels_at_rest(
     InputError
         Records that do not fit each other, or are too short for a level.
     """
-    given = sequence("runs", runs, "a list of (base, response, force or None)")
-    base, response, _ = sequence("run 1", given[0], "(base, response, force or None)", 3)
-    shape = tuple(np.atleast_2d(finite_array("run 1", record)).shape[0] for record in (response, base))
-    records = check_runs(given, sample_rate, shape)
+    records = runs_of_records(runs, sample_rate)
     low, high = (0.0, np.inf) if band is None else sequence("band", band, "(low, high) in Hz", 2)
     level = _levels(records, sample_rate, low, high)
-    n, d = shape
+    n, d = records[0].response.shape[0], records[0].base.shape[0]
     return NoiseLevels(level[:n], level[n : n + d], None if records[0].force is None else level[n + d :])
 
 

@@ -136,7 +136,7 @@ def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
 
 def _start(records: Records) -> tuple[Array, Array] | None:
     """Poles spread over the lines; None where these are too few for one."""
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     room = (records.data.shape[0] // 3 // records.base.shape[0] - 3) // 2  # three real numbers of a channel a function
     count = min(records.n_sensors + _SPARE, _MOST, room)
     return (np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)) if count > 0 else None
@@ -144,7 +144,7 @@ def _start(records: Records) -> tuple[Array, Array] | None:
 
 def _at(records: Records, omega: Array, ratios: Array) -> _AtPoles | None:
     """The fit on those poles that can be modes; None where there are none."""
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return _AtPoles(records, np.log([omega[kept], ratios[kept]]).ravel()) if np.any(kept) else None
@@ -187,7 +187,7 @@ class _AtPoles:
     def ends(self) -> tuple[Array, Array]:
         """Least and largest log w_k and log zeta_k, (2m,) each."""
         least, most = np.full((2, *self.poles.shape), [[-np.inf], [np.inf]])
-        least[: self.omega.size] = np.log(2 * np.pi * self.records.freq[self.records.freq > 0][0])
+        least[: self.omega.size] = np.log(self.records.lines[0])
         most[self.omega.size :] = np.log(_MODE)
         return least, most
 
@@ -278,7 +278,7 @@ def _shows_below(at: _AtPoles) -> bool:
     records = at.records
     if not inside.all() and inside.any():
         at = _AtPoles(records, at.poles.reshape(2, -1)[:, inside].ravel())
-    tail = records.basis(np.maximum(records.freq, records.freq[records.freq > 0][0])[None] ** -2.0 + 0j, records.driven)
+    tail = records.basis(np.maximum(2 * np.pi * records.freq, records.lines[0])[None] ** -2.0 + 0j, records.driven)
     beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
     gained, left = float(np.sum((beyond.T @ at.left) ** 2)), at.left
     noise = records.noise(left, at.count * left.shape[1])

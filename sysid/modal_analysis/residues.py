@@ -123,6 +123,7 @@ class Records:
 
     def __init__(self, test: Measurement, *, force: bool = False) -> None:
         self.freq = test.freq
+        self.lines = 2 * np.pi * test.freq[test.freq > 0]  # rad/s, above zero
         record, std = (test.force, test.force_std) if force else (test.relative, test.response_std)
         assert record is not None
         self.n_sensors, self.n_base = record.shape[1], test.inputs.shape[1]

@@ -126,11 +126,16 @@ def error_of_accelerations(test: Measurement, structure: Structure) -> float:
     return float(np.linalg.norm(weight * columns(test.predict(structure) - test.relative))) / scale
 
 
+def of_residual_modes(test: Measurement, structure: Structure) -> tuple[ComplexArray, ComplexArray]:
+    """Relative accelerations (runs, n_sensors, n_freq) and force (runs, d, n_freq) of a structure's residual modes."""
+    modes = structure.residual
+    motion = np.einsum("kdf,rdf->rkf", modes.motion(test.freq), test.base)
+    return modes.shapes @ motion, modes.participation.T @ motion
+
+
 def residual_share(test: Measurement, structure: Structure) -> float:
     """Share of the relative accelerations that the residual modes of a structure add, of all in the test."""
-    modes = structure.residual
-    added = np.einsum("sk,kdf,rdf->rsf", modes.shapes, modes.motion(test.freq), test.base)
-    return float(np.linalg.norm(added) / np.linalg.norm(test.relative))
+    return float(np.linalg.norm(of_residual_modes(test, structure)[0]) / np.linalg.norm(test.relative))
 
 
 def records_of(test: Measurement) -> list[tuple[ComplexArray, Array | None]]:

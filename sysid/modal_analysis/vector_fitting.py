@@ -111,7 +111,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
     else:
         n = records.freq.size
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     below = omega < lines[0]
     if np.any(below) and np.any(below := below & _of_one_sensor(records, omega, ratios)):  # a sensor's wrong gain
         omega, ratios = _settled(records, omega[~below], ratios[~below], progress)
@@ -221,8 +221,7 @@ def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 
 
     Some `rounds` at most: each moves all of them.
     """
-    lines = 2 * np.pi * records.freq[records.freq > 0]
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
+    omega, ratios = np.geomspace(records.lines[0], records.lines[-1], count), np.full(count, GUESS)
     progress.tell()
     channels = records.principal(count)
     error = np.inf
@@ -311,7 +310,7 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
@@ -387,7 +386,7 @@ def worthwhile(
 
 def _may_be_modes(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
     """Poles that are neither far outside the lines, nor damped as no structure is, nor of a single bad line, (m,)."""
-    lines = 2 * np.pi * records.freq[records.freq > 0]
+    lines = records.lines
     inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < DAMPED)
     broad = ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))
     return inside & (broad | (omega > lines[-1]))
@@ -395,7 +394,7 @@ def _may_be_modes(records: Records, omega: Array, ratios: Array) -> NDArray[np.b
 
 def _lost(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
     """Poles within the lines that can be no modes, (m,)."""
-    first, last = 2 * np.pi * records.freq[records.freq > 0][[0, -1]]
+    first, last = records.lines[[0, -1]]
     return (omega >= first) & (omega <= last) & ~_may_be_modes(records, omega, ratios)
 
 

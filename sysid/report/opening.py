@@ -14,7 +14,7 @@ from sysid.plot.plots import normalised
 from sysid.report.html import bullets, escaped, heat_maps, matrix, no_lines, number, paragraph, prose, sentence, table
 from sysid.results.identification import Identification
 from sysid.results.summary import FIRST, JUDGEMENTS, fitted_in_words, next_steps, verdict
-from sysid.results.tables import counted, deck_masses, half_width, unknown_rows
+from sysid.results.tables import beyond_lines, counted, deck_masses, half_width, runs_can_be_left_out, unknown_rows
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -191,7 +191,7 @@ def _steps(it: Identification) -> list[str]:
     if it.judgement == "one of many":
         return ["Measure more closely what is not known well enough: it is named below."]
     if not it.records.validation:
-        one_by_one = ", or each run by the others: 'sysid refine RESULT --leave-out run'" * (it.measurement.n_runs > 1)
+        one_by_one = ", or each run by the others: 'sysid refine RESULT --leave-out run'" * runs_can_be_left_out(it)
         return [
             f"Predict a test that was not fitted (in Python validation=[...]{one_by_one}): it alone shows what the "
             "model leaves out."
@@ -236,7 +236,8 @@ def _fit(it: Identification, level: NoiseLevel) -> Iterator[tuple[str, str]]:
     yield "the fit leaves", left
     for i, unseen in enumerate(it.validation, start=1):
         missed = number(100 * unseen.residual(it.structure), 3)
-        yield f"unfitted test {i}", f"missed by {missed} % of its accelerations relative to the base"
+        words = f"missed by {missed} % of its accelerations relative to the base{beyond_lines(it, unseen)}"
+        yield f"unfitted test {i}", words
 
 
 def _beside(noise: float, level: NoiseLevel) -> str:

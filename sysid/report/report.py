@@ -180,7 +180,11 @@ def _modes(it: Identification) -> str:
         ["frequency [Hz]", *(value for value, _ in rounded_frequencies), ""],
         ["damping [%]", *(value for value, _ in damping), ""],
     ]
-    notes = ["Effective mass in % of the rigid-body mass of its base direction."]
+    lines = it.measurement.freq
+    notes = [f"Modes within the lines, {number(lines[0])} to {number(lines[-1])} Hz."] * (
+        it.structure.residual.count > 0
+    )
+    notes.append("Effective mass in % of the rigid-body mass of its base direction.")
     if u is not None:
         columns.insert(2, ["±", *(width for _, width in rounded_frequencies), ""])
         columns.append(["±", *(width for _, width in damping), ""])
@@ -248,6 +252,12 @@ def _rigid_body_mass(it: Identification) -> str:
         below = half_widths(rigid, u.rigid_body_mass, it.facts.stated_rigid_body)
         label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not it.facts.stated_rigid_body.any())
     parts += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
+    rows = [
+        (axis, number(total), f"{tables.tilde(open_)}{number(of_modes)}", number(100 * of_modes / total))
+        for axis, total, of_modes, open_, _ in tables.masses_of_modes(it)
+    ]
+    caption = "Effective masses of all modes together, beside the total mass; kg, or kg m² about an axis."
+    parts += table(("base", "total mass", "in these modes", "share [%]"), rows, caption)
     if reference is not None:
         parts += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
     return parts
@@ -263,20 +273,24 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 def _residuals(it: Identification, level: NoiseLevel) -> str:
     """Residual of each channel, beside its noise."""
     test = it.fitted.records
-    left = [1 - score for score in scores(it.structure, test).relative]
-    channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
+    noise = share_of_noise(level.response, test.relative)
     if test.force is not None:
-        noise = share_of_noise(level.force, test.force)
-        force = [*zip(test.base_axes or (), _score(test.predict_force(it.structure), test.force), noise, strict=True)]
-        channels += [(f"base force {axis}", 1 - score, residual) for axis, score, residual in force]
-    known = any(np.isfinite(noise) for *_, noise in channels)
-    rows = [(name, aligned(100 * residual), *[aligned(100 * noise)] * known) for name, residual, noise in channels]
+        noise = np.concatenate([noise, share_of_noise(level.force, test.force)])
+    known, beyond = bool(np.any(np.isfinite(noise))), it.structure.residual.count > 0
+    rows = [
+        (one.channel, aligned(100 * one.left), *[aligned(100 * share)] * known, *[aligned(100 * one.beyond)] * beyond)
+        for one, share in zip(tables.fit_of_channels(it), noise, strict=True)
+    ]
     caption = (
         "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
     )
     caption += "to the base; and its noise likewise." if known else "to the base."
+    caption += (
+        " Of what was measured, modes beyond the lines, which are kept as residual modes, add the last column." * beyond
+    )
     caption += " Outliers that stand alone are left out." * (test is not it.measurement)
-    return table(("channel", "left [%]", *[f"noise{level.bound} [%]"] * known), rows, caption)
+    heads = ("channel", "left [%]", *[f"noise{level.bound} [%]"] * known, *["modes beyond [%]"] * beyond)
+    return table(heads, rows, caption)
 
 
 def _noise(it: Identification) -> str:
@@ -336,7 +350,7 @@ def _validation(it: Identification) -> str:
     for i, test in enumerate(it.validation, start=1):
         parts += [
             f"<h3>Test {i} of {len(it.records.validation)}: predicted, never fitted</h3>",
-            paragraph(f"{_residual(test, it.structure)}."),
+            paragraph(f"{_residual(test, it.structure)}{tables.beyond_lines(it, test)}."),
             _score_table(it, test),
             _responses(it, test, noise_of_test(test, it.structure)),
         ]
@@ -474,9 +488,7 @@ def _what_ran(it: Identification) -> str:
 
 
 def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:
-    size = np.linalg.norm(measured, axis=(0, 2))
-    miss = np.linalg.norm(predicted - measured, axis=(0, 2))
-    return 1 - np.divide(miss, size, out=np.full_like(miss, np.nan), where=size > 0)
+    return 1 - tables.share_of_channels(predicted - measured, measured)
 
 
 def _difference(value: float, reference: float) -> str:

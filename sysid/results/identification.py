@@ -105,13 +105,18 @@ class Recipe:
         given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return ", ".join([f"{self.module} ({given})" if given else self.module, *asked])
 
+    @property
+    def modal(self) -> Modal:
+        """The modal strategy with the modes and sensors asked for."""
+        return Modal(self.sensors or None, modes=self.modes)
+
     def strategy(self, named: str) -> str | Modal:
         """The strategy to identify the problem by: `named`, or the modal one with the modes and sensors asked for."""
         if self.modes is None and not self.sensors:
             return named
         other = f"--modes and --dofs are of the strategy 'modal', and {named!r} is asked for: leave one of both out"
         refuse((named not in ("auto", Modal.name), other))
-        return Modal(self.sensors or None, modes=self.modes)
+        return self.modal
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""

@@ -38,7 +38,7 @@ _OF_A_FIT = ", which holds for a model that fits: this one does not"
 
 def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
-    s, axes, records = it.structure, it.measurement.base_axes or (), it.records
+    s, records = it.structure, it.records
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     sentences = it.undetermined or it.closed_by
     lines = [
@@ -55,7 +55,7 @@ def summary(it: Answer) -> str:
         *filter(None, [it.history.refinement_in_words]),
         *map(str, (*it.of_kind("strategy"), *it.notes)),
         "rigid-body mass "
-        + ", ".join(_rigid_masses(it, axes))
+        + ", ".join(_rigid_masses(it))
         + " (~ normalised: no mass is stated, no force was measured)" * it.facts.unit_mass,
         *_deck_masses(it),
     ]
@@ -68,7 +68,10 @@ def summary(it: Answer) -> str:
             f"frequencies {frequencies} Hz"
         )
     for i, test in enumerate(it.validation, start=1):
-        lines.append(f"test {i} of {len(records.validation)} never fitted: relative residual {test.residual(s):.3e}")
+        lines.append(
+            f"test {i} of {len(records.validation)} never fitted: relative residual {test.residual(s):.3e}"
+            + tables.beyond_lines(it, test)
+        )
     lines += [*_noise(it), *_gains(it)]
     rest = [f"  - {sentence}" for sentence in sentences[FIRST:]]
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
@@ -174,7 +177,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
         one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
             "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
-            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
+            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * tables.runs_can_be_left_out(it)
         ]
     # A goal is of accelerations: it takes no force for explained.
     if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:
@@ -210,7 +213,7 @@ def _mode_table(it: Answer) -> list[str]:
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
     notes += ["~ one of many values that fit as well"] * bool(many.any())
-    return [*lines, "; ".join(notes), *tables.missing_mass(it)]
+    return [*lines, "; ".join(notes), *tables.missing_mass(it), *tables.residual_modes(it)]
 
 
 def _deck_masses(it: Answer) -> list[str]:
@@ -237,12 +240,13 @@ def _unknowns(it: Answer) -> list[str]:
     return [*lines, *[""] * bool(lines)]
 
 
-def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
-    """Rigid-body mass by base direction, with its half-width where noise moves it."""
-    masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
-    for axis, mass, deviation in zip(axes, masses, std, strict=True):
-        words = f"{tables.tilde(it.facts.unit_mass)}{mass:.6g}{tables.known_half_width(deviation, mass, ' +-')}"
-        yield f"{axis} {words} kg{' m²' * (axis[0] == 'r')}"
+def _rigid_masses(it: Answer) -> Iterator[str]:
+    """Rigid-body mass by base direction, with its half-width where noise moves it, and what of it is in the modes."""
+    for one, deviation in zip(tables.masses_of_modes(it), np.diag(it.quick_std("rigid_body_mass")), strict=True):
+        width = tables.known_half_width(deviation, one.rigid_body, " +-")
+        words = f"{tables.tilde(it.facts.unit_mass)}{one.rigid_body:.6g}{width} {one.unit}"
+        modes = f" ({tables.tilde(one.one_of_many)}{one.in_modes:.4g} {one.unit} in these modes)"
+        yield f"{one.axis} {words}" + modes * (not it.facts.unit_mass)
 
 
 def _ranges(it: Answer) -> Iterator[str]:

@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.checks.model_error import LEVEL
 from sysid.assessment.checks.stated import sides_of
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.residues import independent
+from sysid.modal_analysis.response import of_residual_modes, residual_share
 from sysid.results.answer import Answer
-from sysid.structure.structure import Array
+from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT, LIKELY, ROUND_OFF
 
 FREQUENCY, RATIO = "frequency, Hz", "damping ratio"
@@ -204,6 +207,94 @@ def missing_mass(it: Answer) -> list[str]:
     ]
     where = "is in none of these modes: it moves with the base, or in modes beyond the lines"
     return [f"of the rigid-body mass, {', '.join(shares)} {where}"] * bool(shares)
+
+
+class MassOfModes(NamedTuple):
+    """Rigid-body mass in a base direction, and the effective masses of all modes together, one of many or known.
+
+    Both in `unit`, kg or kg m².
+    """
+
+    axis: str
+    rigid_body: float
+    in_modes: float
+    one_of_many: bool
+    unit: str
+
+
+def masses_of_modes(it: Answer) -> list[MassOfModes]:
+    """Rigid-body mass beside that of the modes, a row a base direction."""
+    s, axes = it.structure, it.measurement.base_axes
+    both = np.diag(s.rigid_body_mass).tolist(), np.einsum("kii->i", s.effective_masses).tolist()
+    units = ["kg m²" if axis.startswith("r") else "kg" for axis in axes]
+    return list(map(MassOfModes, axes, *both, map(bool, np.any(is_one_of_many(it), axis=0)), units))
+
+
+class FitOfChannel(NamedTuple):
+    """Shares of what a channel recorded: what the fit leaves of it, and what modes beyond the lines add to it."""
+
+    channel: str
+    left: float
+    beyond: float
+
+
+def fit_of_channels(it: Answer) -> list[FitOfChannel]:
+    """A row a sensor, by its acceleration relative to the base, and a direction of the base force, where measured."""
+    test, s = it.fitted.records, it.structure
+    motion, pull = of_residual_modes(test, s)
+    records = [(test.sensor_names, test.relative, test.predict(s), motion)]
+    if test.force is not None:
+        names = tuple(f"base force {axis}" for axis in test.base_axes)
+        records.append((names, test.force, test.predict_force(s), pull))
+    return [
+        FitOfChannel(name, float(left), float(beyond))
+        for names, record, predicted, added in records
+        for name, left, beyond in zip(
+            names, share_of_channels(predicted - record, record), share_of_channels(added, record), strict=True
+        )
+    ]
+
+
+def residual_modes(it: Answer) -> list[str]:
+    """Sentence on what modes beyond the lines add to the response; nothing without them."""
+    if not it.structure.residual.count:
+        return []
+    test = it.fitted.records
+    most = max(fit_of_channels(it)[: test.n_sensors], key=lambda one: np.nan_to_num(one.beyond))
+    at = f", most at {most.channel}: {100 * most.beyond:.2g} %" * (test.n_sensors > 1)
+    return [f"modes beyond the lines add {100 * residual_share(test, it.structure):.2g} % of the response{at}"]
+
+
+def share_of_channels(part: ComplexArray, records: ComplexArray) -> Array:
+    """Norms of a part over those of the records, channel by channel, (channels,); NaN where nothing was recorded."""
+    size = np.linalg.norm(records, axis=(0, 2))
+    return np.divide(np.linalg.norm(part, axis=(0, 2)), size, out=np.full_like(size, np.nan), where=size > 0)
+
+
+def beyond_lines(it: Answer, test: Measurement) -> str:
+    """Words for lines of a test that are beyond those that were fitted, with its residual apart; else nothing.
+
+    By more than a line's distance, as lines of records of other lengths differ.
+    """
+    fitted, f = it.measurement.freq, test.freq
+    step = max(float(np.median(np.diff(one))) if one.size > 1 else 0.0 for one in (fitted, f))
+    beyond = (f < fitted[0] - step) | (f > fitted[-1] + step)
+    if not np.any(beyond):
+        return ""
+    left, measured = test.predict(it.structure) - test.relative, test.relative
+    parts = [("within", ~beyond), ("beyond", beyond)] if not np.all(beyond) else []
+    norms = [(name, np.linalg.norm(left[..., at]), np.linalg.norm(measured[..., at])) for name, at in parts]
+    apart = ", ".join(f"{100 * missed / size:.3g} % {name}" for name, missed, size in norms if size > 0)
+    words = f"{np.count_nonzero(beyond)} of its {f.size} lines are beyond those that were fitted"
+    return f"; {words} ({fitted[0]:.4g} to {fitted[-1]:.4g} Hz)" + f", and missed by {apart}" * bool(apart)
+
+
+def runs_can_be_left_out(it: Answer) -> bool:
+    """True where there are several runs, and the others excite what free matrices need without some one of them."""
+    base = it.measurement.base
+    rank = lambda runs: independent(runs).shape[1]  # noqa: E731
+    kept = (base[np.arange(len(base)) != run] for run in range(len(base)))
+    return len(base) > 1 and (not it.facts.mass_is_free or any(rank(runs) == rank(base) for runs in kept))
 
 
 def in_columns(rows: Iterable[Sequence[str]], left: Collection[int] = ()) -> list[str]:

@@ -9,6 +9,7 @@ are more modes than sensors, modal coordinates stand beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
@@ -167,10 +169,7 @@ def structure_of_modes(
 def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     """Modes from the data, and the structure that they make."""
     count = _modes_asked(problem, options)
-    if problem.modal[0].by_modes and (count is not None or problem.answers_in_band):
-        poles_of(problem)  # a stated frequency that is none of the records' is told
-        with session.fit_monitor() as watch:
-            problem.fit_records(count, watch)
+    if fit_records_as_asked(problem, options, session.fit_monitor()):
         session.finish()
     monitor = IterationMonitor(session.reporter("local phase"), session.left)
     try:
@@ -215,6 +214,20 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
             raise stopped
         success, message = False, str(stopped) or "interrupted"
     return Outcome(structure, x, options.name, success, message, history, stopped, findings=notes)
+
+
+def fit_records_as_asked(problem: Prepared, options: Modal, monitor: AbstractContextManager[FitMonitor]) -> bool:
+    """Fit whole records with the modes that are asked for and those that stand for all above the lines.
+
+    False where nothing is to be done.
+    """
+    count = _modes_asked(problem, options)
+    if not (problem.modal[0].by_modes and (count is not None or problem.answers_in_band)):
+        return False
+    poles_of(problem)  # a stated frequency that is none of the records' is told
+    with monitor as watch:
+        problem.fit_records(count, watch)
+    return True
 
 
 def _left_out(problem: Prepared, structure: Structure, count: int | None) -> tuple[Finding, ...]:

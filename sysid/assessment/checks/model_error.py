@@ -56,8 +56,8 @@ def unpredicted_tests(context: Context) -> Iterator[Finding]:
     """A test that was not fitted is predicted worse than by a rigid body."""
     if not context.is_judged or context.named:
         return
-    for i, test in enumerate(context.problem.stated.validation, start=1):
-        residual = without_transients_of(test, context.end.structure).residual(context.end.structure)
+    for i, test in _unfitted(context):
+        residual = test.residual(context.end.structure)
         if residual > 1.0:
             yield Finding(
                 "unpredicted", Severity.CONTRADICTS,
@@ -65,6 +65,18 @@ def unpredicted_tests(context: Context) -> Iterator[Finding]:
                 "the sensors move with the table (100 %)",
                 numbers={"test": float(i), "residual": residual},
             )  # fmt: skip
+
+
+def _unfitted(context: Context) -> Iterator[tuple[int, Measurement]]:
+    """Tests that were not fitted, without transients, at the lines that the answer is for, and their numbers from 1.
+
+    The modes of an answer in the band are said to hold at its lines alone.
+    """
+    first, last = context.problem.stated.measurement.freq[[0, -1]]
+    for i, test in enumerate(context.problem.stated.validation, start=1):
+        inside = (test.freq >= first) & (test.freq <= last) | (not context.problem.answers_in_band)
+        if np.any(test.base[..., inside]) and np.any(test.response[..., inside]):
+            yield i, without_transients_of(test.at(inside), context.end.structure)
 
 
 def other_levels(context: Context) -> Iterator[Finding]:
@@ -185,8 +197,7 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
     if not context.is_judged or context.named:
         return
     structure, modal = context.end.structure, context.modal
-    unfitted = [without_transients_of(test, structure) for test in context.problem.stated.validation]
-    missed = [miss for test in unfitted for miss in misses_of_test(test, structure)]
+    missed = [miss for _, test in _unfitted(context) for miss in misses_of_test(test, structure)]
     uneven = bool(modal.scatter is not None or modal.excess)
     if not (uneven or any(miss.times > BEYOND for miss in (*context.misses, *missed))):
         return
