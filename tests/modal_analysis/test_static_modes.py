@@ -68,6 +68,20 @@ def test_the_modes_in_the_lines_are_determined_within_their_deviations(truth, fo
     assert np.abs(off).max() < 4
 
 
+@pytest.mark.parametrize("number", [0, 3, 9])
+def test_poles_close_above_the_lines_draw_nothing_off_the_modes_within(number):
+    """Without a pole beside the static modes the last mode of this frame bends, and passes for coupled damping."""
+    frame = continuous_structure(1)
+    found = sysid.identify(sysid.Problem(draw(frame, number).measurement, mass=sysid.FullMass()), rng=0)
+    beyond, u, last = found.structure.residual, found.uncertainty, frame.lines[1]
+    assert found.determined and found.structure.n == frame.count and not found.contradictions
+    assert np.all(beyond.natural_frequencies > last) and np.all(beyond.natural_frequencies < 2.001 * last)
+    assert beyond.count > beyond.static
+    for name, right in (("natural_frequencies", frame.frequencies), ("damping_ratios", frame.modes.zeta)):
+        off = (getattr(found.structure, name) - right[: frame.count]) / getattr(u, name)
+        assert np.abs(off).max() < 4
+
+
 def test_no_mass_of_the_superelement_is_negative(found):
     mass = found.structure.to_craig_bampton().mass
     size = np.sqrt(np.diag(mass))

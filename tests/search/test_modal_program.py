@@ -306,6 +306,27 @@ def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, s
     assert remainder[-1] < 0.02
 
 
+@pytest.mark.parametrize("d", [1, 3])
+def test_a_start_without_base_mass_ends_where_one_with_all_of_it_does(random_structure, d):
+    """The remainder keeps the rank that it starts with only while no more of it would leave less of the force."""
+    rng = np.random.default_rng(d)
+    structure = random_structure(rng, n=4, d=d, base_mass=2.0)
+    test, truth = trial(rng, structure, force=True, noise=0.01, lines=150), modes_of(structure)
+    modal = ModalEstimate.of_lines(test)
+    remainder = structure.rigid_body_mass - truth.gamma.T @ truth.gamma
+    ends = [
+        solve_modes(
+            modal, truth, relative_spectrum(truth.omega, truth.ratios), unit=np.ones(d), remainder=share * remainder,
+            monitor=IterationMonitor(None, None),
+        )
+        for share in (0.0, 1.0)
+    ]  # fmt: skip
+    assert all(end.status in SOLVED for end in ends)
+    assert ends[0].residual == pytest.approx(ends[1].residual, rel=1e-7)
+    np.testing.assert_allclose(ends[0].rigid, ends[1].rigid, atol=1e-4 * np.abs(ends[1].rigid).max())
+    assert np.linalg.eigvalsh(ends[0].rigid - ends[0].modes.gamma.T @ ends[0].modes.gamma)[0] > 0.1
+
+
 @pytest.mark.parametrize(("d", "force"), [(1, True), (2, False), (3, True)])
 def test_slopes_and_curvatures_by_the_unknowns_of_an_estimate_are_those_of_differences(random_structure, d, force):
     """As many modes as directions share a pole; with a force each one's largest participation is by its logarithm."""
