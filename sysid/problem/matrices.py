@@ -29,6 +29,7 @@ from sysid.models.model import (
 )
 from sysid.models.stiffness_and_damping import WrittenDamping, WrittenStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
+from sysid.problem.residual_terms import ResidualTerms
 from sysid.structure.structure import Array, Structure
 
 MATRICES = ("mass", "stiffness", "damping")
@@ -216,7 +217,7 @@ class Matrices:
     (n, n) of M_SS, and ``H = L^-1 K_SS L^-T`` (n, n); `ratio_function` x and circular frequencies (n,) to damping
     ratios (n,), or to nothing where C tells them; `whole_factor` x to the Cholesky factor of the whole mass (n + d, n +
     d), or to nothing where the model has none. M is `semidefinite` where its model makes it positive semidefinite for
-    every x. `rigid_body` (n, d) is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n)
+    every x. `beyond`, where it is given, are the terms of modes beyond the lines, which follow x. `rigid_body` (n, d) is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n)
     takes them to the sensors.
     """
 
@@ -226,6 +227,7 @@ class Matrices:
     recovery: Array
     whole_factor: ca.Function
     semidefinite: bool = False
+    beyond: ResidualTerms | None = None
 
     @property
     def by_ratios(self) -> bool:
@@ -278,17 +280,21 @@ class Matrices:
         return factor, self.inverse(factor)
 
     def structure(self, x: Array, test: Measurement) -> Structure:
-        """The structure that `x` stands for, with the sensors of a test; refused where it stands for none."""
+        """The structure that `x` stands for, with the sensors of a test; refused where it stands for none.
+
+        Its residual modes, if it has any, are those that explain this test best.
+        """
         M, M_S0, M_00, K, C, H = self.numbers(x)
         G, ratios = self.rigid_body, None
         if self.by_ratios:
             with np.errstate(invalid="ignore"):
                 omega = np.sqrt(np.linalg.eigvalsh(H)) if np.all(np.isfinite(H)) else np.full(len(H), np.nan)
             ratios = np.asarray(self.ratio_function(x, omega)).ravel()
-        return assemble(
+        own = assemble(
             M, M_S0, M_00, K, G, ratios=ratios, damping=None if self.by_ratios else C,
             recovery=None if self.at_sensors else self.recovery, test=test,
         )  # fmt: skip
+        return own if self.beyond is None else own.with_residual(self.beyond.of(test).fitted(own))
 
 
 def assemble(
