@@ -23,7 +23,7 @@ import scipy
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import STATIC_POLE
-from sysid.modal_analysis.response import columns, gains, records_of, weights_of_test
+from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.superelement import ResidualModes
 from sysid.structure.thresholds import round_off
@@ -43,9 +43,14 @@ class ResidualTerms:
 
     @classmethod
     def above(cls, test: Measurement, omega: Array, ratios: Array) -> ResidualTerms:
-        """At those of the poles of a test that are not far above its lines, and at one that is chosen farther above."""
+        """At those of the poles of a test that are not far above its lines, else at one near them; and at one above.
+
+        The last two are chosen: what a mode anywhere above adds in the lines is nearly a sum of what these add.
+        """
         last, (far, damping) = 2 * np.pi * test.freq[-1], STATIC_POLE
         near = (omega > last) & (omega < np.sqrt(far) * last)  # what is farther the chosen one stands for
+        if not np.any(near):
+            omega, ratios, near = np.array([ABOVE * last]), np.array([damping]), np.array([True])
         return cls(test, np.append(omega[near], far * last), np.append(ratios[near], damping))
 
     def of(self, test: Measurement, shift: float = 0.0) -> ResidualTerms:
