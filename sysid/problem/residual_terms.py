@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_fit import STATIC_POLE
 from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -58,10 +59,16 @@ class ResidualTerms:
         return self if test is self.test and shift == self.shift else replace(self, test=test, shift=shift)
 
     @cached_property
-    def _functions(self) -> ComplexArray:
-        """``g_p u_j`` of all poles and base directions, (p d, runs * n_freq)."""
+    def functions(self) -> ComplexArray:
+        """``g_p u_j`` of all poles and base directions, (p d, runs, n_freq)."""
         g, u = gains(self.test.freq, self.omega, self.ratios, self.shift), self.test.base
-        return columns(np.einsum("pf,rdf->rpdf", g, u).reshape(len(u), -1, g.shape[1]))
+        return np.einsum("pf,rdf->pdrf", g, u).reshape(-1, len(u), g.shape[1])
+
+    @property
+    def by_channel(self) -> bool:
+        """True where each channel has residues of its own, and weights its lines as the others of its record do."""
+        alike = all(len(products(std, record.shape)) == 1 for record, std in records_of(self.test))
+        return alike and (self.test.force is None or self.test.n_base == 1)
 
     @cached_property
     def _pairs(self) -> list[tuple[int, int]]:
@@ -71,7 +78,8 @@ class ResidualTerms:
     @cached_property
     def _columns(self) -> list[list[Array]]:
         """Columns of each record as rows of `as_rows`: of accelerations a channel each, of the force all together."""
-        functions, n, d = self._functions, self.test.n_sensors, self.test.n_base
+        functions = self.functions.reshape(len(self.functions), -1)
+        n, d = self.test.n_sensors, self.test.n_base
         weights = [weight / scale for weight, scale in weights_of_test(self.test, weighted=True)]
         found = [[_as_rows(functions[:, None] * weights[0][i]) for i in range(n)]]
         if self.test.force is not None:
