@@ -87,10 +87,14 @@ def _in_band_in_words(test: Measurement, structure: Structure) -> str:
     what += f" and {coordinates}, which the Craig-Bampton form (to_craig_bampton()) holds" * bool(others)
     if structure.n < structure.n_sensors:
         what += "; a mode that the base does not excite is not among them"
-    if beyond.count:
-        share = 100 * residual_share(test, structure)
-        what += f"; modes beyond the lines add {share:.2g} % of the response, and are kept as residual modes"
+    what += f"; {beyond_in_words(test, structure)}" * bool(beyond.count)
     return f"determined in {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz: {what}"
+
+
+def beyond_in_words(test: Measurement, structure: Structure) -> str:
+    """Share of the responses that residual modes add, in words."""
+    share = 100 * residual_share(test, structure)
+    return f"modes beyond the lines add {share:.2g} % of the response, and are kept as residual modes"
 
 
 def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) -> str:

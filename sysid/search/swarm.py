@@ -148,8 +148,9 @@ class Swarm:
                 "total_mass only, or take strategy 'modal'"
             )
         n, poles = problem.geometry.n, problem.poles
-        # What stands out above the lines is a residual mode where modes are free.
-        last = 2 * np.pi * problem.measurement.freq[-1] if problem.free_modes else np.inf
+        # What stands out above the lines is a residual mode where modes are free, or these are asked for.
+        beyond = problem.free_modes or problem.formulation.residual_modes
+        last = 2 * np.pi * problem.measurement.freq[-1] if beyond else np.inf
         omega = np.zeros(0) if poles is None else poles.omega[poles.omega <= last]
         if omega.size <= n:
             return None
