@@ -18,7 +18,20 @@ from benchmarks.band.finite_elements import OnBase
 from benchmarks.band.own_process import answer, figures_of_each
 from benchmarks.band.simulated_tests import of_spectra
 from benchmarks.band.structures import (
-    APART, END, LEAST, NOISE, RATIOS, REACH, SPECTRA, START, Candidate, Continuous, beam, chosen, frame, log_uniform,
+    APART,
+    END,
+    LEAST,
+    NOISE,
+    RATIOS,
+    REACH,
+    SPECTRA,
+    START,
+    Candidate,
+    Continuous,
+    beam,
+    chosen,
+    frame,
+    log_uniform,
     plate,
 )  # fmt: skip
 from benchmarks.line import Line, above
@@ -46,10 +59,10 @@ def lines(reduced: bool) -> Iterator[Line]:
         text = f"{len(found)} continuous structures by {name}: share with a fit to the noise (chi² over its degrees of "
         text += f"freedom at most {TO_NOISE:g}), and w, zeta, R_k within {FAR:g} deviations (each: {far})"
         yield above(text, float(np.mean(good)), SHARE)
-        yield Line(f"by {name}: residual modes in the answer, least and most",
-                   f"{min(it.get('residual', 0) for it in found)}, {max(it.get('residual', 0) for it in found)}")  # fmt: skip
-        yield Line(f"by {name}: seconds of processor time of the slowest",
-                   f"{max(it.get('seconds', np.nan) for it in found):.1f}")  # fmt: skip
+        counts = [it.get("residual", 0) for it in found]
+        yield Line(f"by {name}: residual modes in the answer, least and most", f"{min(counts)}, {max(counts)}")
+        seconds = max(it.get("seconds", np.nan) for it in found)
+        yield Line(f"by {name}: seconds of processor time of the slowest", f"{seconds:.1f}")
 
 
 def searched(number: int) -> Continuous:
@@ -111,7 +124,8 @@ def _figures(truth: Continuous, test: sysid.Measurement, problem: sysid.Problem,
         (truth.modes.shapes[:, :k] * truth.modes.gamma[:k, 0]).ravel(),
     ])  # fmt: skip
     found = np.concatenate([
-        np.log(2 * np.pi * s.natural_frequencies), np.log(s.damping_ratios), (s.mode_shapes * s.participation[:, 0]).ravel(),
+        np.log(2 * np.pi * s.natural_frequencies), np.log(s.damping_ratios),
+        (s.mode_shapes * s.participation[:, 0]).ravel(),
     ])  # fmt: skip
     far = float(np.max(np.abs(found - exact) / deviations(truth, test)))
     chi2 = float(2 * np.sum(np.abs(left) ** 2) / freedom)

@@ -38,8 +38,8 @@ _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not 
 def applies(formulation: Formulation) -> bool:
     """True where the cone holds all models that explain the data, and what is stated of them.
 
-    So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness; not where
-    residual modes are asked for beside a model of a form of its own.
+    So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness; not
+    where residual modes are asked for beside a model of a form of its own.
     """
     if formulation.residual_modes and not formulation.free_modes:
         return False

@@ -294,7 +294,7 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
     term, inflation = formulation.own_test, 1.0
     scattered = term.estimate.scattered if structure.modal_damping else None  # as `rows_of_test` does
     if formulation.fits_records:
-        fitted = x.size + (term.matrices.beyond.size if term.matrices.beyond else 0)
+        fitted = x.size + term.matrices.beyond.size
         inflation = inflation_of(test, noise_records(test, structure, fitted), fitted, scattered)
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)

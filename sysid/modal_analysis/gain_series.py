@@ -106,7 +106,7 @@ class SummedRecord:
     series : GainSeries
     static : bool
         Whether there are d modes of gain 1 behind those of the series.
-    beyond : (k, runs, n_freq), complex, optional
+    beyond : (k, runs, n_freq), complex
         Functions of which every channel has the best sum, real, on top.
 
     Notes
@@ -125,7 +125,7 @@ class SummedRecord:
         series: GainSeries,
         *,
         static: bool = False,
-        beyond: ComplexArray | None = None,
+        beyond: ComplexArray,
     ) -> None:
         recovery, self._line = channel[:, None] * recovery, line
         self._metric = recovery.T @ recovery
@@ -142,8 +142,8 @@ class SummedRecord:
         self._gains, self._static_gains = coordinates[: n * terms].reshape(n, terms, -1), coordinates[n * terms :]
         self._overlap = np.ascontiguousarray(overlap[: n * terms].reshape(n, terms, -1).swapaxes(1, 2))
         self._static_overlap = overlap[n * terms :]
-        self._beyond = None
-        if beyond is not None:
+        self._beyond: tuple[Array, ...] = ()
+        if len(beyond):
             basis = _orthonormal((line * beyond).reshape(len(beyond), -1), ROUND_OFF)[1].reshape(-1, *line.shape)
             moved = np.einsum("qrf,rdf->qdf", basis.conj(), u)
             onto = np.tensordot(_functions(series.basis, still), moved, (1, 2)).real  # (functions, q, d)
@@ -177,11 +177,10 @@ class SummedRecord:
         onto_loads = np.einsum("kdsp,ksp->kdp", overlap.reshape(m, d, -1, count), by_mode[0])
         squared = self.size - 2 * np.einsum("kdp,kdp->p", onto_loads, by_mode[1])
         squared += np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), inner)
-        return squared if self._beyond is None else squared - self._explained(shapes, loads, polynomials[..., :count])
+        return squared - self._explained(shapes, loads, polynomials[..., :count]) if self._beyond else squared
 
     def _explained(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
         """Part of the squared error that the functions beyond explain, (count,)."""
-        assert self._beyond is not None
         recovery, of_gains, of_static, target = self._beyond
         n = len(of_gains)
         moved = np.einsum("jkp,kjqd->pkqd", polynomials, of_gains)

@@ -267,7 +267,7 @@ class TestObjective:
 
     def __init__(self, test: Measurement, matrices: Matrices, shift: float) -> None:
         self.test, self.matrices, self.shift = test, matrices, shift
-        self.beyond = matrices.beyond and matrices.beyond.of(test, shift)
+        self.beyond = matrices.beyond.of(test, shift)
         x = ca.MX.sym("x", matrices.function.numel_in(0))
         if matrices.by_ratios:
             parts = matrices.of_modes(x)
@@ -297,7 +297,7 @@ class TestObjective:
         ratios = self.matrices.ratio_function(x, omega)
         at_sensors = phi if self.matrices.at_sensors else ca.DM(self.matrices.recovery) @ phi
         miss = residual(self.test, at_sensors, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
-        miss = miss if self.beyond is None else self.beyond.without_in(miss)
+        miss = self.beyond.without_in(miss)
         # Negative ratios are no structure's.
         squared = ca.if_else(ca.mmin(ratios) < 0, np.nan, ca.sumsqr(miss))
         return ca.Function("squared", [phi, gamma, omega, rigid, x], [squared])
@@ -336,8 +336,7 @@ class TestObjective:
         every = zip(records, weights_of_test(test, weighted=True), strict=True)
         for i, ((record, predicted), (weight, scale)) in enumerate(every):
             miss = weight / scale * (predicted - columns(record))
-            if self.beyond is not None:
-                miss = np.moveaxis(self.beyond.without(i, np.moveaxis(miss, 0, -1)), -1, 0)
+            miss = np.moveaxis(self.beyond.without(i, np.moveaxis(miss, 0, -1)), -1, 0)
             squared += np.sum(np.abs(miss) ** 2, axis=(1, 2))
         squared[broken | light] = np.nan
         return squared

@@ -217,13 +217,13 @@ class Rows:
 
 
 def rows_of_test(
-    modal: ModalEstimate, s: Slopes, unknowns: int, beyond: ResidualTerms | None = None, *, share: float = 1.0,
+    modal: ModalEstimate, s: Slopes, unknowns: int, beyond: ResidualTerms, *, share: float = 1.0,
     as_stated: bool = False,
 ) -> list[Rows]:  # fmt: skip
     """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
 
     Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
-    it is not, as where a test is planned. Where modes `beyond` the lines are fitted, what they explain is left out.
+    it is not, as where a test is planned. What modes `beyond` the lines explain is left out.
     """
     test = modal.records
     if s.structure.modal_damping:
@@ -241,14 +241,14 @@ def rows_of_test(
         d_f = d_f + np.einsum("edc,rdf->erfc", s.d_rigid, u, optimize=True)
         parts.append(d_f.reshape(d_f.shape[0], -1, d_f.shape[-1]))
     rows: list[Rows] = []
-    unknowns += 0 if beyond is None else beyond.size
+    unknowns += beyond.size
     records = noise_records(test, s.structure, unknowns)
     inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
     every = zip(records, parts, weights_of_test(test, weighted=True), strict=True)
     for i, (record, change, (weight, scale)) in enumerate(every):
         weights = share * weight / scale
         both = weights[..., None] * np.concatenate([-record.misfit[..., None], change], axis=2)
-        both = both if beyond is None else beyond.without(i, both)
+        both = beyond.without(i, both)
         left, flat = both[..., 0].ravel(), both[..., 1:].reshape(-1, change.shape[-1])
         std = inflation * (weights * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, refuse
 from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import separate_poles
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.model import Geometry, MatrixModel, Stated, ratios_of
 from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site
@@ -446,31 +445,10 @@ class Formulation:
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
         functions = self._function("matrices", blocks.outputs), self._function("ratios", [blocks.ratios], blocks.omega)
         whole = self._function("whole_factor", [blocks.whole_factor])
-        beyond = self._beyond(geometry)
+        # Where modes are free, and nothing is asked for, a search that is made for their frequencies finds those above.
+        asked, found = self.residual_modes, getattr(self.models[1], "natural_frequencies", None) is None
+        beyond = ResidualTerms.of_geometry(geometry, free=self.free_modes, asked=asked, found=found)
         return Matrices(*functions, geometry.rigid_body, geometry.recovery, whole, blocks.mass.mass is None, beyond)
-
-    def _beyond(self, geometry: Geometry) -> ResidualTerms | None:
-        """Terms of modes beyond the lines; None where the problem has none.
-
-        Where modes are free, and nothing is asked for, they come with poles above the lines that are none of as many
-        modes as there are degrees of freedom.
-        """
-        modal, last = geometry.modal, 2 * np.pi * geometry.test.freq[-1]
-        looked_for = modal.by_modes or getattr(self.models[1], "natural_frequencies", None) is None
-        if not (self.residual_modes or (self.free_modes and looked_for)):
-            return None
-        ratios = geometry.pole_ratios
-        omega = geometry.poles.omega if ratios.size else np.zeros(0)
-        if self.free_modes:
-            above = np.arange(omega.size) >= geometry.n
-            omega, ratios = omega[above], ratios[above]
-            if not self.residual_modes and not np.any(omega > last):
-                return None
-        if modal.by_modes and self.free_modes and np.any(omega > last):
-            separate = separate_poles(modal.modes)[0]
-            separate = separate[(separate >= geometry.n) & (modal.omega[separate] > last)]
-            return ResidualTerms(geometry.test, modal.omega[separate], modal.ratios[separate])
-        return ResidualTerms.above(geometry.test, omega, ratios)
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""

@@ -217,8 +217,8 @@ class Matrices:
     (n, n) of M_SS, and ``H = L^-1 K_SS L^-T`` (n, n); `ratio_function` x and circular frequencies (n,) to damping
     ratios (n,), or to nothing where C tells them; `whole_factor` x to the Cholesky factor of the whole mass (n + d, n +
     d), or to nothing where the model has none. M is `semidefinite` where its model makes it positive semidefinite for
-    every x. `beyond`, where it is given, are the terms of modes beyond the lines, which follow x. `rigid_body` (n, d) is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n)
-    takes them to the sensors.
+    every x. `beyond` are the terms of modes beyond the lines, which follow x. `rigid_body` (n, d)
+    is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n) takes them to the sensors.
     """
 
     function: ca.Function
@@ -226,8 +226,8 @@ class Matrices:
     rigid_body: Array
     recovery: Array
     whole_factor: ca.Function
-    semidefinite: bool = False
-    beyond: ResidualTerms | None = None
+    semidefinite: bool
+    beyond: ResidualTerms
 
     @property
     def by_ratios(self) -> bool:
@@ -294,7 +294,7 @@ class Matrices:
             M, M_S0, M_00, K, G, ratios=ratios, damping=None if self.by_ratios else C,
             recovery=None if self.at_sensors else self.recovery, test=test,
         )  # fmt: skip
-        return own if self.beyond is None else own.with_residual(self.beyond.of(test).fitted(own))
+        return own.with_residual(self.beyond.of(test).fitted(own))
 
 
 def assemble(

@@ -21,10 +21,12 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
-from sysid.modal_analysis.modal_fit import STATIC_POLE
+from sysid.modal_analysis.modal_fit import STATIC_POLE, separate_poles
 from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
+from sysid.models.model import Geometry
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.superelement import ResidualModes
 from sysid.structure.thresholds import round_off
@@ -41,6 +43,26 @@ class ResidualTerms:
     omega: Array
     ratios: Array
     shift: float = 0.0
+
+    @classmethod
+    def of_geometry(cls, geometry: Geometry, *, free: bool, asked: bool, found: bool) -> ResidualTerms:
+        """Terms of a test that a model with these degrees of freedom is fitted to; without poles where it has none.
+
+        They come where they are `asked` for. Of a model whose modes are `free` the lowest poles of the records are its
+        own; others above the lines make terms too, where they are `found` anyway.
+        """
+        modal, test = geometry.modal, geometry.test
+        none = cls(test, np.zeros(0), np.zeros(0))
+        if not (asked or (free and (found or modal.by_modes))):
+            return none
+        ratios = geometry.pole_ratios
+        omega = geometry.poles.omega if ratios.size else ratios
+        first = geometry.n if free else 0
+        above = omega[first:] > 2 * np.pi * test.freq[-1]
+        if free and modal.by_modes and np.any(above):
+            separate = np.intersect1d(separate_poles(modal.modes)[0], first + np.flatnonzero(above))
+            return cls(test, omega[separate], ratios[separate])
+        return cls.above(test, omega[first:], ratios[first:]) if asked or np.any(above) else none
 
     @classmethod
     def above(cls, test: Measurement, omega: Array, ratios: Array) -> ResidualTerms:
@@ -66,14 +88,16 @@ class ResidualTerms:
 
     @property
     def by_channel(self) -> bool:
-        """True where each channel has residues of its own, and weights its lines as the others of its record do."""
+        """True where each channel has residues of its own, if any, and weighs its lines as others of its record do."""
+        if not self.omega.size:
+            return True
         alike = all(len(products(std, record.shape)) == 1 for record, std in records_of(self.test))
         return alike and (self.test.force is None or self.test.n_base == 1)
 
     @cached_property
     def _pairs(self) -> list[tuple[int, int]]:
         """Entries of a symmetric matrix that are free."""
-        return [(i, j) for i in range(self.test.n_base) for j in range(i + 1)]
+        return list(zip(*np.tril_indices(self.test.n_base), strict=True))
 
     @cached_property
     def _columns(self) -> list[list[Array]]:
@@ -111,13 +135,15 @@ class ResidualTerms:
     @property
     def size(self) -> int:
         """Number of numbers that are fitted."""
-        return sum(int(basis.shape[1]) for basis in self._bases)
+        return sum(int(basis.shape[1]) for basis in self._bases) if self.omega.size else 0
 
     def without(self, number: int, misfit: ComplexArray) -> ComplexArray:
         """What the best residues leave of weighted misfits of a record, 0 of accelerations, 1 of the force.
 
         Misfits and answer are (channels, runs * n_freq, k), each of the k by itself.
         """
+        if not self.omega.size:
+            return misfit
         basis, (channels, lines, count) = self._bases[number], misfit.shape
         rows = np.moveaxis(misfit, 0, 1).reshape(-1, count)
         rows = np.concatenate([rows.real, rows.imag])
@@ -126,6 +152,8 @@ class ResidualTerms:
 
     def without_in(self, rows: ca.MX) -> ca.MX:
         """The same of the rows of `response.residual`, as an expression."""
+        if not self.omega.size:
+            return rows
         basis = ca.DM(scipy.sparse.block_diag(self._bases, format="csc"))
         return rows - basis @ (basis.T @ rows)
 
@@ -135,6 +163,8 @@ class ResidualTerms:
         As many at each pole as base directions. D_p is positive semidefinite; without a force they carry no mass.
         """
         test, d = self.test, self.test.n_base
+        if not self.omega.size:
+            return ResidualModes.none(test.n_sensors, d)
         predicted = [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
         left = [
             weight / scale * columns(record - answer)
@@ -150,7 +180,7 @@ class ResidualTerms:
         if test.force is not None:
             found = self._masses(_as_rows(left[1][None])[:, 0])
             roots = np.linalg.cholesky(found + _LEAST * np.diag(totals)).swapaxes(1, 2)  # D = Gamma' Gamma
-        modes = ResidualModes(
+        modes = ResidualModes(  # as many at each pole as base directions
             np.repeat(self.omega, d) / (2 * np.pi), np.repeat(self.ratios, d),
             np.einsum("npd,pdk->npk", shapes, np.linalg.inv(roots)).reshape(len(shapes), -1), roots.reshape(-1, d),
             self.omega.size * d,
@@ -166,23 +196,21 @@ class ResidualTerms:
         if np.all(lam >= 0):
             return free
         # Of F F', with F from the part that is positive, and nowhere zero, as it would have no slope there.
-        rows, unit = np.linalg.qr(group), np.linalg.norm(group, axis=0)
-        wanted = rows[0].T @ left
-        size = np.abs(lam).max()
-        start = np.linalg.cholesky((vectors * np.maximum(lam, 1e-3 * size)[:, None]) @ vectors.swapaxes(1, 2))
-        lower = np.tril_indices(self.test.n_base)
+        Q, R = np.linalg.qr(group)
+        size, wanted, lower = np.abs(lam).max(), Q.T @ left, np.tril_indices(self.test.n_base)
+        start = np.linalg.cholesky((vectors * np.maximum(lam / size, 1e-3)[:, None]) @ vectors.swapaxes(1, 2))
 
         def matrices(entries: Array) -> Array:
             F = np.zeros_like(free)
             F[:, *lower] = entries.reshape(shape)
-            return np.sqrt(size) * F @ (np.sqrt(size) * F).swapaxes(1, 2)
+            return np.asarray(size * F @ F.swapaxes(1, 2))
 
         def miss(entries: Array) -> Array:
-            D = matrices(entries)
-            return np.asarray(rows[1] @ np.array([one[i, j] for one in D for i, j in self._pairs]) - wanted)
+            return np.asarray(R @ matrices(entries)[:, *lower].ravel() - wanted)
 
-        assert np.all(unit > 0)
-        end = scipy.optimize.least_squares(miss, (start[:, *lower] / np.sqrt(size)).ravel(), xtol=1e-12, ftol=1e-12)
+        end = scipy.optimize.least_squares(miss, start[:, *lower].ravel(), xtol=1e-12, ftol=1e-12)
+        if not end.success:
+            raise SolverError(f"no masses of residual modes are found that are not negative: {end.message}")
         return matrices(end.x)
 
     def _symmetric(self, entries: Array) -> Array:

@@ -97,8 +97,7 @@ class TestTerm:
 
     def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
         """Relative residuals of accelerations and, where measured, of the force; modes are read with ratios only."""
-        rows, beyond = self._rows(x, modes), self.matrices.beyond
-        return self.weight * (rows if beyond is None else beyond.of(self.test, self.shift).without_in(rows))
+        return self.weight * self.matrices.beyond.of(self.test, self.shift).without_in(self._rows(x, modes))
 
     def _rows(self, x: ca.MX, modes: ModeSymbols | None) -> ca.MX:
         """The same before the weight of the test, of the model's own modes alone."""
@@ -118,7 +117,7 @@ class TestTerm:
     @cached_property
     def estimate(self) -> ModalEstimate:
         """The estimate of its modes; of lines alone where modes beyond them are fitted, which are not told there."""
-        return self.modal if self.matrices.beyond is None else ModalEstimate.of_lines(self.test)
+        return ModalEstimate.of_lines(self.test) if self.matrices.beyond.omega.size else self.modal
 
     @cached_property
     def batch(self) -> TestObjective:
@@ -162,7 +161,7 @@ class TestTerm:
 
     def rows_of(self, slopes: Slopes, unknowns: int, *, as_stated: bool = False) -> list[Rows]:
         """Rows of each record, see `rows_of_test`."""
-        beyond = self.matrices.beyond and self.matrices.beyond.of(self.test)
+        beyond = self.matrices.beyond.of(self.test)
         return rows_of_test(self.estimate, slopes, unknowns, beyond, share=self.weight, as_stated=as_stated)
 
     def findings(self, x: Array) -> Sequence[Finding]:

@@ -95,16 +95,17 @@ class InverseFactorError:
     and log zeta (n,). Residual modes, r of them at poles that are held, have shapes (n, r), by columns, and with a base
     force participations, an upper triangle (d, d) a pole; else these are unit matrices.
 
-    `sizes` tells how many there are of R, P, N, S, of residual modes, and log w with log zeta. Functions of the coordinates and Psi_0
-    (n, n) are `value`, `gradient` (the value beside it), `hessian`, and `modes`: shapes (n, n), participations (n, d)
-    and rigid-body mass (d, d). `totals` takes the entries of R, P and N to what is stated of totals beside a measured
-    base force, each relative to its value and zero where it is met; no rows where nothing is stated.
+    `sizes` tells how many there are of R, P, N, S, of residual modes, and log w with log zeta. Functions of the
+    coordinates and Psi_0 (n, n) are `value`, `gradient` (the value beside it), `hessian`, and `modes`: shapes (n, n),
+    participations (n, d) and rigid-body mass (d, d). `totals` takes the entries of R, P and N to what is stated of
+    totals beside a measured base force, each relative to its value and zero where it is met; no rows where nothing is
+    stated.
     """
 
     def __init__(self, problem: Prepared) -> None:
         test, n, d = problem.measurement, problem.geometry.n, problem.geometry.d
         weighed, beyond = test.force is not None, problem.formulation.matrices.beyond
-        omega, ratios = (np.zeros(0),) * 2 if beyond is None else (beyond.omega.repeat(d), beyond.ratios.repeat(d))
+        omega, ratios = beyond.omega.repeat(d), beyond.ratios.repeat(d)
         r, corner = omega.size, weighed * d * (d + 1) // 2
         self.sizes = (n * (n + 1) // 2, n * d, corner, n * (n - 1) // 2, n * r + r // d * corner, 2 * n)
         y, psi_0 = ca.MX.sym("y", sum(self.sizes)), ca.MX.sym("psi_0", n, n)

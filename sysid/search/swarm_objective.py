@@ -49,7 +49,7 @@ def held_spectrum_objective(
     """
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
-    if term.matrices.beyond is not None and not term.matrices.beyond.of(term.test).by_channel:
+    if not term.matrices.beyond.of(term.test).by_channel:
         return None
     s, matrices = ca.MX.sym("s", problem.n_variables), term.matrices
     x = unknowns(s)
@@ -80,7 +80,7 @@ class HeldSpectrumObjective:
         sizes: list[tuple[float, float]] = []
         scales = weights_of_test(test, weighted=True)
         every = zip(self._records, records_of(test), scales, recovery, strict=False)
-        beyond = term.matrices.beyond and term.matrices.beyond.of(test, term.shift).functions
+        beyond = term.matrices.beyond.of(test, term.shift).functions
         for summed, (record, std), (_, scale), seen in every:
             static = summed is self._records[1]
             for runs, channel, line in products(std, record.shape):

@@ -1,4 +1,4 @@
-"""Modes beyond the lines beside a written model: eliminated as least squares would, with exact derivatives, in the answer."""
+"""Modes beyond the lines beside a written model: eliminated by least squares, exact derivatives, the answer."""
 
 import casadi as ca
 import numpy as np
@@ -133,7 +133,7 @@ def test_the_structure_holds_the_residual_modes_that_are_best(case):
 
 
 def test_masses_of_residual_modes_are_the_best_that_are_not_negative():
-    """Conditions of Karush, Kuhn and Tucker: D and the slope by it are positive semidefinite, and their product zero."""
+    """Conditions of Karush, Kuhn and Tucker: D and the slope by it are positive semidefinite, their product zero."""
     structure = truth(ratios=True, loads=((1.5, 0.2), (0.0, 0.0)))
     made = problem(measured(structure, force=True, noise=0.05), ratios=True)
     test, s = made.measurement, made.structure(made.formulation.guess)
@@ -173,7 +173,9 @@ def test_a_further_test_has_residual_modes_of_its_own():
     made = problem(measured(truth(ratios=False), force=False), ratios=False)
     k, b = made.variables
     K = STRETCH.T @ ca.diag(k) @ STRETCH
-    second = sysid.FurtherTest(measured(truth(ratios=False), force=False, seed=5), mass=MASS, stiffness=K, damping=b * K)
+    second = sysid.FurtherTest(
+        measured(truth(ratios=False), force=False, seed=5), mass=MASS, stiffness=K, damping=b * K
+    )
     both = sysid.Problem(
         made.measurement, mass=MASS, stiffness=K, damping=b * K, residuals=[second], residual_modes=True
     )
