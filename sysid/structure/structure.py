@@ -151,14 +151,9 @@ class Structure:
         self._coupling = B
 
     def _set_residual(self, residual: ResidualModes) -> None:
-        shape = len(residual.shapes), residual.participation.shape[1]
-        refuse(
-            (
-                shape != (self.n_sensors, self.n_base),
-                f"the residual modes are of {shape[0]} sensors and {shape[1]} base directions, the structure of "
-                f"{self.n_sensors} and {self.n_base}",
-            )
-        )
+        theirs, ours = (len(residual.shapes), residual.participation.shape[1]), (self.n_sensors, self.n_base)
+        words = "the residual modes are of {} sensors and {} base directions, the structure of {} and {}"
+        refuse((theirs != ours, words.format(*theirs, *ours)))
         self.residual = residual
 
     def with_residual(self, residual: ResidualModes) -> Structure:
