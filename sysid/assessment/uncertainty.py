@@ -40,7 +40,7 @@ from sysid.assessment.sensitivity import (
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
 from sysid.modal_analysis.misfit import inflation_of, noise_records
-from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
+from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
@@ -253,6 +253,8 @@ def moves_by_records(
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
+    if modal.by_modes and modal.omega.size != modes.omega.size:  # residual modes of other numbers: by the lines
+        modal = ModalEstimate.of_lines(modal.records)
     if modal.by_modes and modal.static:  # which turns change nothing holds where their information was taken
         at = slice(-modal.static, None)
         modes.phi[:, at], modes.gamma[at] = modal.phi[:, at], modal.gamma[at]

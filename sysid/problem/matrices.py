@@ -280,21 +280,22 @@ class Matrices:
         return factor, self.inverse(factor)
 
     def structure(self, x: Array, test: Measurement) -> Structure:
-        """The structure that `x` stands for, with the sensors of a test; refused where it stands for none.
+        """`own_structure`, with the residual modes, if it has any, that explain the test best."""
+        own = self.own_structure(x, test)
+        return own.with_residual(self.beyond.of(test).fitted(own))
 
-        Its residual modes, if it has any, are those that explain this test best.
-        """
+    def own_structure(self, x: Array, test: Measurement) -> Structure:
+        """The structure that `x` stands for, with the sensors of a test; refused where it stands for none."""
         M, M_S0, M_00, K, C, H = self.numbers(x)
         G, ratios = self.rigid_body, None
         if self.by_ratios:
             with np.errstate(invalid="ignore"):
                 omega = np.sqrt(np.linalg.eigvalsh(H)) if np.all(np.isfinite(H)) else np.full(len(H), np.nan)
             ratios = np.asarray(self.ratio_function(x, omega)).ravel()
-        own = assemble(
+        return assemble(
             M, M_S0, M_00, K, G, ratios=ratios, damping=None if self.by_ratios else C,
             recovery=None if self.at_sensors else self.recovery, test=test,
         )  # fmt: skip
-        return own.with_residual(self.beyond.of(test).fitted(own))
 
 
 def assemble(

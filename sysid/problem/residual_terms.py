@@ -21,15 +21,16 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_fit import STATIC_POLE, separate_poles
+from sysid.modal_analysis.residues import Records, linear_residues
 from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
+from sysid.modal_analysis.spectra_modes import misses_static
 from sysid.models.model import Geometry
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.superelement import ResidualModes
-from sysid.structure.thresholds import round_off
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class ResidualTerms:
         """Terms of a test that a model with these degrees of freedom is fitted to; without poles where it has none.
 
         They come where they are `asked` for. Of a model whose modes are `free` the lowest poles of the records are its
-        own; others above the lines make terms too, where they are `found` anyway.
+        own; others above the lines make terms too, where they are `found` anyway, as does what grows as w² beside them.
         """
         modal, test = geometry.modal, geometry.test
         none = cls(test, np.zeros(0), np.zeros(0))
@@ -62,7 +63,8 @@ class ResidualTerms:
         if free and modal.by_modes and np.any(above):
             separate = np.intersect1d(separate_poles(modal.modes)[0], first + np.flatnonzero(above))
             return cls(test, omega[separate], ratios[separate])
-        return cls.above(test, omega[first:], ratios[first:]) if asked or np.any(above) else none
+        more = asked or np.any(above) or _grows_as_static(geometry, omega, ratios)
+        return cls.above(test, omega[first:], ratios[first:]) if more else none
 
     @classmethod
     def above(cls, test: Measurement, omega: Array, ratios: Array) -> ResidualTerms:
@@ -178,7 +180,7 @@ class ResidualTerms:
         totals = np.diag(structure.rigid_body_mass)
         roots = np.tile(np.eye(d), (self.omega.size, 1, 1))
         if test.force is not None:
-            found = self._masses(_as_rows(left[1][None])[:, 0])
+            found = self._masses(_as_rows(left[1][None])[:, 0], np.sqrt(totals))
             roots = np.linalg.cholesky(found + _LEAST * np.diag(totals)).swapaxes(1, 2)  # D = Gamma' Gamma
         modes = ResidualModes(  # as many at each pole as base directions
             np.repeat(self.omega, d) / (2 * np.pi), np.repeat(self.ratios, d),
@@ -187,41 +189,51 @@ class ResidualTerms:
         )  # fmt: skip
         return modes if test.force is not None else modes.without_mass(totals)
 
-    def _masses(self, left: Array) -> Array:
-        """D_p, (p, d, d), positive semidefinite, that explain best what is left of the force, in rows."""
-        (group,) = self._columns[1]
-        shape = self.omega.size, len(self._pairs)
-        free = self._symmetric(_solved(group, left).reshape(shape))
-        lam, vectors = np.linalg.eigh(free)
-        if np.all(lam >= 0):
-            return free
-        # Of F F', with F from the part that is positive, and nowhere zero, as it would have no slope there.
-        Q, R = np.linalg.qr(group)
-        size, wanted, lower = np.abs(lam).max(), Q.T @ left, np.tril_indices(self.test.n_base)
-        start = np.linalg.cholesky((vectors * np.maximum(lam / size, 1e-3)[:, None]) @ vectors.swapaxes(1, 2))
+    def _masses(self, left: Array, unit: Array, rounds: int = 100) -> Array:
+        """D_p, (p, d, d), positive semidefinite, that explain best what is left of the force, in rows; `unit` (d,).
 
-        def matrices(entries: Array) -> Array:
-            F = np.zeros_like(free)
-            F[:, *lower] = entries.reshape(shape)
-            return np.asarray(size * F @ F.swapaxes(1, 2))
-
-        def miss(entries: Array) -> Array:
-            return np.asarray(R @ matrices(entries)[:, *lower].ravel() - wanted)
-
-        end = scipy.optimize.least_squares(miss, start[:, *lower].ravel(), xtol=1e-12, ftol=1e-12)
-        if not end.success:
-            raise SolverError(f"no masses of residual modes are found that are not negative: {end.message}")
-        return matrices(end.x)
+        Sums of ``v v'`` by non-negative least squares, with further v where the slope by D is most negative, until chi²
+        could hardly fall (M. Jaggi, Proc. 30th Int. Conf. Machine Learning (2013) 427-435).
+        """
+        rows, columns = np.tril_indices(self.test.n_base)
+        Q, R = np.linalg.qr(self._columns[1][0])
+        R, wanted = R * np.tile(unit[rows] * unit[columns], self.omega.size), Q.T @ left
+        free = self._symmetric(_solved(R, wanted))
+        directions = np.linalg.eigh(free)[1].swapaxes(1, 2)  # (p, k, d)
+        for _ in range(rounds):
+            atoms = directions[..., rows] * directions[..., columns]
+            design = np.einsum("epq,pkq->epk", R.reshape(len(R), *free.shape[:1], -1), atoms)
+            share = scipy.optimize.nnls(design.reshape(len(R), -1), wanted)[0].reshape(atoms.shape[:2])
+            entries = np.einsum("pk,pkq->pq", share, atoms).ravel()
+            miss = R @ entries - wanted
+            slope = self._symmetric((R.T @ miss) * np.tile(np.where(rows == columns, 1.0, 0.5), self.omega.size))
+            lowest, vectors = np.linalg.eigh(slope)
+            gain = -np.sum(np.minimum(lowest[:, 0], 0.0) * np.einsum("pii->p", np.abs(free)))
+            if gain <= NEGLIGIBLE * (left @ left):
+                break
+            directions = np.concatenate([directions, vectors[:, None, :, 0]], axis=1)
+        return self._symmetric(entries) * np.outer(unit, unit)
 
     def _symmetric(self, entries: Array) -> Array:
-        """Matrices (p, d, d) of their free entries, (p, pairs)."""
-        D = np.zeros((len(entries), self.test.n_base, self.test.n_base))
-        for k, (i, j) in enumerate(self._pairs):
-            D[:, i, j] = D[:, j, i] = entries[:, k]
+        """Matrices (p, d, d) of their free entries, (p pairs,)."""
+        rows, columns = np.tril_indices(self.test.n_base)
+        D = np.zeros((self.omega.size, self.test.n_base, self.test.n_base))
+        D[:, rows, columns] = D[:, columns, rows] = entries.reshape(self.omega.size, -1)
         return D
 
 
 _LEAST = 1e-6  # of the rigid-body mass, that residual modes have in each direction at least
+
+
+def _grows_as_static(geometry: Geometry, omega: Array, ratios: Array) -> bool:
+    """True where as many modes as a model has leave of the lines of a test what modes above add far below them."""
+    test = geometry.test
+    inside = (omega >= 2 * np.pi * test.freq[0]) & (omega <= 2 * np.pi * test.freq[-1])
+    if geometry.modal.by_modes or not np.any(inside) or geometry.natural_frequencies.size < geometry.n:
+        return False
+    records = Records(test)
+    _, left = linear_residues(test, omega, ratios)
+    return bool(left > EXACT) and misses_static(test, records, omega, ratios)
 
 
 def _as_rows(parts: ComplexArray) -> Array:

@@ -133,7 +133,7 @@ class TestTerm:
         if not self.matrices.by_ratios:
             return float(self._norm(x))
         try:
-            s = self.matrices.structure(x, self.test)
+            s = self.matrices.own_structure(x, self.test)
         except InputError:
             return float("nan")
         return float(self._norm(x, s.normal_modes, 2 * np.pi * s.natural_frequencies))
