@@ -185,10 +185,8 @@ class SummedRecord:
         n = len(of_gains)
         moved = np.einsum("jkp,kjqd->pkqd", polynomials, of_gains)
         onto = np.einsum("pkqd,pkd->pkq", moved, loads[:, :n])
-        onto_channels = np.einsum("pks,pkq->psq", shapes[:, :n], onto)
-        if len(of_static):
-            still = np.einsum("qd,pkd->pkq", of_static[0], loads[:, n:])
-            onto_channels += np.einsum("pks,pkq->psq", shapes[:, n:], still)
+        still = np.einsum("eqd,pkd->pkq", of_static, loads[:, n:])  # one function, if any
+        onto_channels = np.einsum("pks,pkq->psq", shapes, np.concatenate([onto, still], axis=1))
         left = np.einsum("cs,psq->pcq", recovery, onto_channels) - target
         return np.einsum("pcq,pcq->p", left, left)
 

@@ -150,7 +150,7 @@ class ModeFit:
         poles, and second modes at a pole, that stood for what these modes explain.
         """
         test, (_, d) = self.test, self.test.rigid_body.shape
-        if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
+        if not self._goes_on or (best.status == "settled" and not misses_static(test, self.records, *_poles_of(best))):
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
         omega, ratios = _poles_of(best)
@@ -181,9 +181,6 @@ class ModeFit:
         fit = replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=self.test.n_base)
         found = fit.of_modes(counts)
         return fit._grown(found, counts) if self.grows else found
-
-    def _misses_static(self, best: ModalFit) -> bool:
-        return best.of_accelerations > EXACT and misses_static(self.test, self.records, *_poles_of(best))
 
     def at_strongest(self, count: int, inside: NDArray[np.bool_]) -> tuple[ModeFit, NDArray[np.bool_], Integers]:
         """The same at so many of the poles `inside`, those whose loss the records would feel most, and at all others.
@@ -370,4 +367,4 @@ def misses_static(test: Measurement, records: Records, omega: Array, ratios: Arr
     rising = records.basis(rise + 0j)
     along = np.linalg.qr(rising - beside @ (beside.T @ rising))[0].T @ free.left
     noise = records.noise(free.left, free.residues.size)
-    return bool(np.sum(along**2) > noise * beyond_chance(along.size))
+    return bool(np.sum(along**2) > max(noise * beyond_chance(along.size), EXACT**2 * records.size))

@@ -24,13 +24,13 @@ import scipy
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_fit import STATIC_POLE, separate_poles
-from sysid.modal_analysis.residues import Records, linear_residues
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
 from sysid.modal_analysis.spectra_modes import misses_static
 from sysid.models.model import Geometry
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.superelement import ResidualModes
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
+from sysid.structure.thresholds import NEGLIGIBLE, round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +91,8 @@ class ResidualTerms:
     @property
     def by_channel(self) -> bool:
         """True where each channel has residues of its own, if any, and weighs its lines as others of its record do."""
-        if not self.omega.size:
-            return True
         alike = all(len(products(std, record.shape)) == 1 for record, std in records_of(self.test))
-        return alike and (self.test.force is None or self.test.n_base == 1)
+        return self.omega.size == 0 or (alike and (self.test.force is None or self.test.n_base == 1))
 
     @cached_property
     def _pairs(self) -> list[tuple[int, int]]:
@@ -231,9 +229,7 @@ def _grows_as_static(geometry: Geometry, omega: Array, ratios: Array) -> bool:
     inside = (omega >= 2 * np.pi * test.freq[0]) & (omega <= 2 * np.pi * test.freq[-1])
     if geometry.modal.by_modes or not np.any(inside) or geometry.natural_frequencies.size < geometry.n:
         return False
-    records = Records(test)
-    _, left = linear_residues(test, omega, ratios)
-    return bool(left > EXACT) and misses_static(test, records, omega, ratios)
+    return misses_static(test, Records(test), omega, ratios)
 
 
 def _as_rows(parts: ComplexArray) -> Array:
