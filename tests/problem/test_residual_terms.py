@@ -16,12 +16,12 @@ SPRINGS = np.array([3000.0, 6000.0, 4000.0])
 MASS = np.diag([4.0, 5.0, 3.0, 2.0, 1.0])
 
 
-def truth(*, ratios, loads=((1.5, 0.2), (0.3, 1.0))):
-    """Three masses in two directions, and two modes above the lines."""
+def truth(*, ratios, loads=((1.5, 0.2), (0.3, 1.0)), times=1.0):
+    """Three masses in two directions, and two modes above the lines, whose shapes may be so many times as large."""
     K = STRETCH.T @ np.diag(SPRINGS) @ STRETCH
     damping = {"damping_ratios": [0.02, 0.03, 0.02]} if ratios else {"damping_matrix": 3e-3 * K[:3, :3]}
     own = sysid.Structure(MASS, K, n_base=2, **damping)
-    shapes = np.array([[0.2, 0.05], [-0.1, 0.2], [0.15, 0.1]])
+    shapes = times * np.array([[0.2, 0.05], [-0.1, 0.2], [0.15, 0.1]])
     beyond = sysid.ResidualModes(1.0 * np.array([14.0, 21.0]), np.array([0.01, 0.02]), shapes, np.array(loads))
     return own.with_residual(beyond)
 
@@ -158,7 +158,7 @@ def test_masses_of_residual_modes_are_the_best_that_are_not_negative():
 def test_a_model_without_the_higher_modes_has_its_springs_within_deviations(ratios):
     far = []
     for seed in range(3):
-        made = problem(measured(truth(ratios=ratios), force=True, seed=seed), ratios=ratios)
+        made = problem(measured(truth(ratios=ratios, times=3.0), force=True, seed=seed), ratios=ratios)
         result = sysid.identify(made, rng=0)
         assert result.judgement == "determined"
         far.append((result.values["k"] - SPRINGS) / result.uncertainty.variables["k"])
@@ -166,7 +166,7 @@ def test_a_model_without_the_higher_modes_has_its_springs_within_deviations(rati
     assert np.sqrt(np.mean(np.square(far))) < 1.7
     assert np.abs(far).max() < 4
     without = sysid.identify(problem(made.measurement, ratios=ratios, residual_modes=False), rng=0)
-    assert without.judgement == "no fit" or without.contradictions
+    assert without.judgement == "no fit"
 
 
 def test_a_further_test_has_residual_modes_of_its_own():
