@@ -202,6 +202,12 @@ BENCHMARKS = (
         "band.above_first_mode", "lines that begin above the first mode: nothing right accused", "10 min", "20 s"
     ),
     Benchmark("band.wrong_sensors", "one wrong sensor among modes beyond the lines: named", "40 min", "20 s"),
+    Benchmark(
+        "band.residuals_in_searches",
+        "swarm and hpso-ls with modes beyond the lines: fits to the noise",
+        "5 min",
+        "20 s",
+    ),
     Benchmark("band.exported", "answers in the band by other programs, in time, against the test", "8 min", "20 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )

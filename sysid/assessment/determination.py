@@ -189,7 +189,9 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
         (x.size - count, f"{x.size - count} of them by constraints"),
     )
     fixing = ", ".join(sentence for number, sentence in closed if number)
-    return (f"{fixing} about this answer; what is written as a number counts as exact",), tuple(open_)
+    beyond = modal_mass_cone.beyond_in_words(problem.measurement, structure)
+    sentences = f"{fixing} about this answer; what is written as a number counts as exact", beyond
+    return sentences[: 1 + bool(structure.residual.count)], tuple(open_)
 
 
 def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]:

@@ -38,8 +38,11 @@ _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not 
 def applies(formulation: Formulation) -> bool:
     """True where the cone holds all models that explain the data, and what is stated of them.
 
-    So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
+    So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness; not
+    where residual modes are asked for beside a model of a form of its own.
     """
+    if formulation.residual_modes and not formulation.free_modes:
+        return False
     linear = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
     return linear and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
@@ -84,10 +87,14 @@ def _in_band_in_words(test: Measurement, structure: Structure) -> str:
     what += f" and {coordinates}, which the Craig-Bampton form (to_craig_bampton()) holds" * bool(others)
     if structure.n < structure.n_sensors:
         what += "; a mode that the base does not excite is not among them"
-    if beyond.count:
-        share = 100 * residual_share(test, structure)
-        what += f"; modes beyond the lines add {share:.2g} % of the response, and are kept as residual modes"
+    what += f"; {beyond_in_words(test, structure)}" * bool(beyond.count)
     return f"determined in {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz: {what}"
+
+
+def beyond_in_words(test: Measurement, structure: Structure) -> str:
+    """Share of the responses that residual modes add, in words."""
+    share = 100 * residual_share(test, structure)
+    return f"modes beyond the lines add {share:.2g} % of the response, and are kept as residual modes"
 
 
 def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) -> str:

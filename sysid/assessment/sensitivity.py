@@ -45,7 +45,7 @@ def parametrisation(problem: Prepared, structure: Structure, modes: Modes, index
     static = structure.residual.static
     if static:  # its pole is none that is fitted, and turning these modes into each other changes nothing
         keep[index.log_omega][-static:] = keep[index.log_ratios][-static:] = False
-        gauge = np.hstack([gauge, _turns(phi, gamma, index, static, all_=test.force is None)])
+        gauge = np.hstack([gauge, _turns(modes, index, static, all_=test.force is None)])
     free = Parametrisation(slope, unit, gauge)
     if not problem.formulation.damping.free:
         free, keep[index.log_ratios] = _with_ratios_tied(problem, structure, modes, index, free), False
@@ -53,10 +53,11 @@ def parametrisation(problem: Prepared, structure: Structure, modes: Modes, index
     return Parametrisation(free.slope[:, keep], free.unit[keep], free.gauge[keep])
 
 
-def _turns(phi: Array, gamma: Array, index: Index, count: int, *, all_: bool) -> Array:
-    """Moves of theta, (size, moves), that mix the last modes, at one pole: rotations, or with `all_` any but scales."""
-    last, columns = range(len(gamma) - count, len(gamma)), []
-    for i, j in ((i, j) for i in last for j in last if i < j or (all_ and i > j)):
+def _turns(modes: Modes, index: Index, count: int, *, all_: bool) -> Array:
+    """Moves of theta, (size, moves), that mix the last modes at each pole: rotations, or with `all_` any but scales."""
+    (phi, gamma, omega, _), columns = modes, []
+    last = range(len(gamma) - count, len(gamma))
+    for i, j in ((i, j) for i in last for j in last if omega[i] == omega[j] and (i < j or (all_ and i > j))):
         of_phi, of_gamma = np.zeros_like(phi), np.zeros_like(gamma)
         of_phi[:, i], of_gamma[j] = phi[:, j], -gamma[i]
         if not all_:

@@ -40,11 +40,11 @@ from sysid.assessment.sensitivity import (
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
 from sysid.modal_analysis.misfit import inflation_of, noise_records
-from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
+from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
-from sysid.problem.direct_response import Slopes, rows_of_test, slopes_of
+from sysid.problem.direct_response import Slopes, slopes_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
@@ -253,6 +253,8 @@ def moves_by_records(
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
+    if modal.by_modes and modal.omega.size != modes.omega.size:  # residual modes of other numbers: by the lines
+        modal = ModalEstimate.of_lines(modal.records)
     if modal.by_modes and modal.static:  # which turns change nothing holds where their information was taken
         at = slice(-modal.static, None)
         modes.phi[:, at], modes.gamma[at] = modal.phi[:, at], modal.gamma[at]
@@ -291,10 +293,11 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
     if formulation.fits_records:
         known, shifts = _with_gains(formulation, x, slopes, known)
     steps, count = known.steps, known.normals.shape[1]
-    scattered = problem.modal[0].scattered if structure.modal_damping else None  # as `rows_of_test` does
-    inflation = 1.0
+    term, inflation = formulation.own_test, 1.0
+    scattered = term.estimate.scattered if structure.modal_damping else None  # as `rows_of_test` does
     if formulation.fits_records:
-        inflation = inflation_of(test, noise_records(test, structure, x.size), x.size, scattered)
+        fitted = x.size + term.matrices.beyond.size
+        inflation = inflation_of(test, noise_records(test, structure, fitted), fitted, scattered)
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     moves = Perturbations(count, *(part @ steps for part in parts))
@@ -317,14 +320,14 @@ def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensi
     """
     term, structure = formulation.own_test, slopes.structure
     test = term.test
-    possible = gain_errors(term.modal, structure).possible
-    rows = rows_of_test(term.modal, slopes, x.size, share=term.weight)[0]
+    possible = gain_errors(term.estimate, structure).possible
+    rows = term.rows_of(slopes, x.size)[0]
     weight, scale = weights_of_test(test, weighted=True)[0]
     whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
     size = term.weight * weight / scale * whole
     if len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
-        factor = term.weight / scale * independent_rows(term.modal)[0]
-        pull = rows.jacobian.T @ (factor @ term.modal.gain.moves)
+        factor = term.weight / scale * independent_rows(term.estimate)[0]
+        pull = rows.jacobian.T @ (factor @ term.estimate.gain.moves)
     else:
         pulls = rows.jacobian.reshape(2, *size.shape, -1)
         pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)

@@ -99,14 +99,15 @@ class PolesAndResidues:
             parts.append(self.force[1 + modes] + 1j * self.force[1 + self.omega.size + modes])
         return np.einsum("ksd,rd->krs", np.concatenate(parts, axis=1), base)
 
-    def smoothed(self, test: Measurement, share: float, lines: int = 80) -> Smoothed:
-        """The test, at so many lines, with a shift of this share of its mean frequency.
+    def smoothed(self, test: Measurement, share: float, highest: float = np.inf, lines: int = 80) -> Smoothed:
+        """The test, at so many lines, `highest` Hz at most, with a shift of this share of its mean frequency.
 
         It has one run for each independent base motion.
         """
         shift = share * float(np.exp(np.log(self.omega).mean()))
         ends = self.omega[[0, -1]] / (2 * np.pi)
-        freq = np.linspace(max((1 - BEYOND) * ends[0], 1e-3 * ends[1]), (1 + BEYOND) * ends[1], lines)
+        highest = min((1 + BEYOND) * ends[1], highest)
+        freq = np.linspace(max((1 - BEYOND) * ends[0], 1e-3 * ends[1]), highest, lines)
         base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
         relative, force = self.records(freq, base, shift)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)

@@ -106,6 +106,8 @@ class SummedRecord:
     series : GainSeries
     static : bool
         Whether there are d modes of gain 1 behind those of the series.
+    beyond : (k, runs, n_freq), complex
+        Functions of which every channel has the best sum, real, on top.
 
     Notes
     -----
@@ -123,6 +125,7 @@ class SummedRecord:
         series: GainSeries,
         *,
         static: bool = False,
+        beyond: ComplexArray,
     ) -> None:
         recovery, self._line = channel[:, None] * recovery, line
         self._metric = recovery.T @ recovery
@@ -139,6 +142,14 @@ class SummedRecord:
         self._gains, self._static_gains = coordinates[: n * terms].reshape(n, terms, -1), coordinates[n * terms :]
         self._overlap = np.ascontiguousarray(overlap[: n * terms].reshape(n, terms, -1).swapaxes(1, 2))
         self._static_overlap = overlap[n * terms :]
+        self._beyond: tuple[Array, ...] = ()
+        if len(beyond):
+            basis = _orthonormal((line * beyond).reshape(len(beyond), -1), ROUND_OFF)[1].reshape(-1, *line.shape)
+            moved = np.einsum("qrf,rdf->qdf", basis.conj(), u)
+            onto = np.tensordot(_functions(series.basis, still), moved, (1, 2)).real  # (functions, q, d)
+            of_gains = onto[: n * terms].reshape(n, terms, *onto.shape[1:])
+            target = np.einsum("qrf,rcf->cq", basis.conj(), weighted).real
+            self._beyond = recovery, of_gains, onto[n * terms :], target
 
     def squared(self, shapes: Array, loads: Array, polynomials: Array, inner: Array | None = None) -> Array:
         """Squared error of candidates, (count,).
@@ -165,7 +176,19 @@ class SummedRecord:
         by_mode = [np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (shapes, loads)]
         onto_loads = np.einsum("kdsp,ksp->kdp", overlap.reshape(m, d, -1, count), by_mode[0])
         squared = self.size - 2 * np.einsum("kdp,kdp->p", onto_loads, by_mode[1])
-        return squared + np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), inner)
+        squared += np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), inner)
+        return squared - self._explained(shapes, loads, polynomials[..., :count]) if self._beyond else squared
+
+    def _explained(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
+        """Part of the squared error that the functions beyond explain, (count,)."""
+        recovery, of_gains, of_static, target = self._beyond
+        n = len(of_gains)
+        moved = np.einsum("jkp,kjqd->pkqd", polynomials, of_gains)
+        onto = np.einsum("pkqd,pkd->pkq", moved, loads[:, :n])
+        still = np.einsum("eqd,pkd->pkq", of_static, loads[:, n:])  # one function, if any
+        onto_channels = np.einsum("pks,pkq->psq", shapes, np.concatenate([onto, still], axis=1))
+        left = np.einsum("cs,psq->pcq", recovery, onto_channels) - target
+        return np.einsum("pcq,pcq->p", left, left)
 
     def inner(self, loads: Array, polynomials: Array) -> Array:
         """Inner products of the modes' accelerations over all lines, (count, m, m)."""

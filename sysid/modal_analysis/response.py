@@ -9,7 +9,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import factors_of_runs, separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
-_ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
+ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
 
 
 def columns(record: ComplexArray) -> ComplexArray:
@@ -206,7 +206,7 @@ def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> Compl
 def modes_above(freq: Array, last: float) -> Array:
     """Functions w² and of a pole not far above the last line, Hz, which modes above the lines add, (2, n_freq)."""
     s = freq / last
-    return np.stack([s**2, s**2 / (_ABOVE**2 - s**2)])
+    return np.stack([s**2, s**2 / (ABOVE**2 - s**2)])
 
 
 def gains_with_velocity(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:

@@ -162,7 +162,7 @@ class ModeFit:
         poles, and second modes at a pole, that stood for what these modes explain.
         """
         test, (_, d) = self.test, self.test.rigid_body.shape
-        if not self._goes_on or (best.status == "settled" and not self._misses_static(best)):
+        if not self._goes_on or (best.status == "settled" and not misses_static(test, self.records, *_poles_of(best))):
             return best
         (times, ratio), last = STATIC_POLE, 2 * np.pi * float(test.freq[-1])
         omega, ratios = _poles_of(best)
@@ -193,21 +193,6 @@ class ModeFit:
         fit = replace(self, poles=replace(self.poles, omega=omega, ratios=ratios), static=self.test.n_base)
         found = fit.of_modes(counts)
         return fit._grown(found, counts) if self.grows else found
-
-    def _misses_static(self, best: ModalFit) -> bool:
-        """True where what free residues leave at the poles of a fit grows as w², beyond chance.
-
-        Beside a constant, which a wrong gain makes.
-        """
-        records = self.records
-        if best.of_accelerations <= EXACT:
-            return False
-        free, noise = self._free_residues(*_poles_of(best))
-        rise = modes_above(self.test.freq, self.test.freq[-1])[:1]
-        beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
-        rising = records.basis(rise + 0j)
-        along = np.linalg.qr(rising - beside @ (beside.T @ rising))[0].T @ free.left
-        return bool(np.sum(along**2) > noise * beyond_chance(along.size))
 
     def at_strongest(self, count: int, inside: NDArray[np.bool_]) -> tuple[ModeFit, NDArray[np.bool_], Integers]:
         """The same at so many of the poles `inside`, those whose loss the records would feel most, and at all others.
@@ -430,3 +415,17 @@ def _poles_of(fit: ModalFit) -> tuple[Array, Array]:
     """Circular frequencies and damping ratios of the poles of a fit, each once, in its order."""
     modes = fit.modes.at(separate_poles(fit.modes)[0])
     return modes.omega, modes.ratios
+
+
+def misses_static(test: Measurement, records: Records, omega: Array, ratios: Array) -> bool:
+    """True where what free residues leave at poles grows as w², beyond chance; `records` are those of the test.
+
+    Beside a constant, which a wrong gain makes.
+    """
+    free = records.fit(omega, ratios)
+    rise = modes_above(test.freq, test.freq[-1])[:1]
+    beside = np.linalg.qr(np.hstack([free.Q, records.basis(np.ones_like(rise) + 0j)]))[0]
+    rising = records.basis(rise + 0j)
+    along = np.linalg.qr(rising - beside @ (beside.T @ rising))[0].T @ free.left
+    noise = records.noise(free.left, free.residues.size)
+    return bool(np.sum(along**2) > max(noise * beyond_chance(along.size), EXACT**2 * records.size))

@@ -267,6 +267,7 @@ class TestObjective:
 
     def __init__(self, test: Measurement, matrices: Matrices, shift: float) -> None:
         self.test, self.matrices, self.shift = test, matrices, shift
+        self.beyond = matrices.beyond.of(test, shift)
         x = ca.MX.sym("x", matrices.function.numel_in(0))
         if matrices.by_ratios:
             parts = matrices.of_modes(x)
@@ -296,6 +297,7 @@ class TestObjective:
         ratios = self.matrices.ratio_function(x, omega)
         at_sensors = phi if self.matrices.at_sensors else ca.DM(self.matrices.recovery) @ phi
         miss = residual(self.test, at_sensors, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
+        miss = self.beyond.without_in(miss)
         # Negative ratios are no structure's.
         squared = ca.if_else(ca.mmin(ratios) < 0, np.nan, ca.sumsqr(miss))
         return ca.Function("squared", [phi, gamma, omega, rigid, x], [squared])
@@ -331,7 +333,10 @@ class TestObjective:
         if test.force is not None:
             records.append((test.force, B.swapaxes(1, 2) @ a + rigid @ base))
         squared = np.zeros(count)
-        for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=True), strict=True):
-            squared += np.sum(np.abs(weight * (predicted - columns(record))) ** 2, axis=(1, 2)) / scale**2
+        every = zip(records, weights_of_test(test, weighted=True), strict=True)
+        for i, ((record, predicted), (weight, scale)) in enumerate(every):
+            miss = weight / scale * (predicted - columns(record))
+            miss = np.moveaxis(self.beyond.without(i, np.moveaxis(miss, 0, -1)), -1, 0)
+            squared += np.sum(np.abs(miss) ** 2, axis=(1, 2))
         squared[broken | light] = np.nan
         return squared

@@ -25,6 +25,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import parts_of, weights_of_test
 from sysid.models.unknowns import NO_COMPLEX, user_site
 from sysid.problem.matrices import Matrices, Motion
+from sysid.problem.residual_terms import ResidualTerms
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -216,12 +217,13 @@ class Rows:
 
 
 def rows_of_test(
-    modal: ModalEstimate, s: Slopes, unknowns: int, *, share: float = 1.0, as_stated: bool = False
-) -> list[Rows]:
+    modal: ModalEstimate, s: Slopes, unknowns: int, beyond: ResidualTerms, *, share: float = 1.0,
+    as_stated: bool = False,
+) -> list[Rows]:  # fmt: skip
     """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
 
     Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
-    it is not, as where a test is planned.
+    it is not, as where a test is planned. What modes `beyond` the lines explain is left out.
     """
     test = modal.records
     if s.structure.modal_damping:
@@ -239,12 +241,16 @@ def rows_of_test(
         d_f = d_f + np.einsum("edc,rdf->erfc", s.d_rigid, u, optimize=True)
         parts.append(d_f.reshape(d_f.shape[0], -1, d_f.shape[-1]))
     rows: list[Rows] = []
+    unknowns += beyond.size
     records = noise_records(test, s.structure, unknowns)
     inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
-    for record, change, (weight, scale) in zip(records, parts, weights_of_test(test, weighted=True), strict=True):
+    every = zip(records, parts, weights_of_test(test, weighted=True), strict=True)
+    for i, (record, change, (weight, scale)) in enumerate(every):
         weights = share * weight / scale
-        flat = (weights[..., None] * change).reshape(-1, change.shape[-1])
-        left, std = (-weights * record.misfit).ravel(), inflation * (weights * record.std).ravel() / np.sqrt(2)
+        both = weights[..., None] * np.concatenate([-record.misfit[..., None], change], axis=2)
+        both = beyond.without(i, both)
+        left, flat = both[..., 0].ravel(), both[..., 1:].reshape(-1, change.shape[-1])
+        std = inflation * (weights * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
     return rows
 

@@ -24,6 +24,7 @@ from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.model import Geometry, MatrixModel, Stated, ratios_of
 from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site
 from sysid.problem.matrices import MATRICES, Blocks, Matrices, blocks_of, symbols_in
+from sysid.problem.residual_terms import ResidualTerms
 from sysid.problem.terms import (
     Builder,
     ExpressionTerm,
@@ -100,7 +101,7 @@ class Formulation:
     """Unknowns and objective of a search, of what a `Problem` states; each part is made when it is first asked for.
 
     `modal` are the modal estimates of the problem's own test and of further ones among the residuals, `models` those of
-    mass, stiffness and damping.
+    mass, stiffness and damping. With `residual_modes` what modes beyond the lines add is fitted to every test.
     """
 
     def __init__(
@@ -112,8 +113,10 @@ class Formulation:
         constraints: Sequence[Any] = (),
         misfit: Any = None,
         healing: Mapping[Variable, Any] | None = None,
+        *,
+        residual_modes: bool = False,
     ) -> None:
-        self.models, self.geometry = models, geometry
+        self.models, self.geometry, self.residual_modes = models, geometry, residual_modes
         self.sources: list[tuple[str, TermSource]] = []
         if misfit is not None:
             self.sources.append(("misfit", Residual(misfit, is_misfit=True)))
@@ -442,7 +445,10 @@ class Formulation:
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
         functions = self._function("matrices", blocks.outputs), self._function("ratios", [blocks.ratios], blocks.omega)
         whole = self._function("whole_factor", [blocks.whole_factor])
-        return Matrices(*functions, geometry.rigid_body, geometry.recovery, whole, blocks.mass.mass is None)
+        # Where modes are free, and nothing is asked for, a search that is made for their frequencies finds those above.
+        asked, found = self.residual_modes, getattr(self.models[1], "natural_frequencies", None) is None
+        beyond = ResidualTerms.of_geometry(geometry, free=self.free_modes, asked=asked, found=found)
+        return Matrices(*functions, geometry.rigid_body, geometry.recovery, whole, blocks.mass.mass is None, beyond)
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""

@@ -29,6 +29,7 @@ from sysid.models.model import (
 )
 from sysid.models.stiffness_and_damping import WrittenDamping, WrittenStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
+from sysid.problem.residual_terms import ResidualTerms
 from sysid.structure.structure import Array, Structure
 
 MATRICES = ("mass", "stiffness", "damping")
@@ -216,8 +217,8 @@ class Matrices:
     (n, n) of M_SS, and ``H = L^-1 K_SS L^-T`` (n, n); `ratio_function` x and circular frequencies (n,) to damping
     ratios (n,), or to nothing where C tells them; `whole_factor` x to the Cholesky factor of the whole mass (n + d, n +
     d), or to nothing where the model has none. M is `semidefinite` where its model makes it positive semidefinite for
-    every x. `rigid_body` (n, d) is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n)
-    takes them to the sensors.
+    every x. `beyond` are the terms of modes beyond the lines, which follow x. `rigid_body` (n, d)
+    is the motion of the degrees of freedom for unit base motion, `recovery` (n_sensors, n) takes them to the sensors.
     """
 
     function: ca.Function
@@ -225,7 +226,8 @@ class Matrices:
     rigid_body: Array
     recovery: Array
     whole_factor: ca.Function
-    semidefinite: bool = False
+    semidefinite: bool
+    beyond: ResidualTerms
 
     @property
     def by_ratios(self) -> bool:
@@ -278,6 +280,11 @@ class Matrices:
         return factor, self.inverse(factor)
 
     def structure(self, x: Array, test: Measurement) -> Structure:
+        """`own_structure`, with the residual modes, if it has any, that explain the test best."""
+        own = self.own_structure(x, test)
+        return own.with_residual(self.beyond.of(test).fitted(own))
+
+    def own_structure(self, x: Array, test: Measurement) -> Structure:
         """The structure that `x` stands for, with the sensors of a test; refused where it stands for none."""
         M, M_S0, M_00, K, C, H = self.numbers(x)
         G, ratios = self.rigid_body, None

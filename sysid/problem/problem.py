@@ -68,6 +68,10 @@ class Problem(StatedProblem, SearchSpace):
         A mode must show at more than one line. `objective` and `residual` are of the records without numbers that stand
         alone.
 
+    residual_modes : bool
+        Fit what modes above the lines add to each test beside a model that has none of them, as one of fewer elements
+        than the structure: `Structure.residual`. With a mass and a stiffness that are free they come by themselves.
+
     Attributes
     ----------
     variables : tuple of Unknown
@@ -102,6 +106,7 @@ class Problem(StatedProblem, SearchSpace):
             validation=[Measurement.from_tree(test) for test in tree["validation"]],
             goal=tree["goal"],
             loss=tree["loss"],
+            residual_modes=tree.get("residual_modes", False),  # results of before have none
         )
         vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:

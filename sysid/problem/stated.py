@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, as_float, choice, instance, refuse
+from sysid.errors import InputError, as_float, choice, flag, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.mass import FullMass
@@ -46,6 +46,7 @@ class StatedProblem:
     validation: Sequence[Measurement] = field(default=(), kw_only=True)
     goal: float | None = field(default=None, kw_only=True)
     loss: Literal["squares", "huber"] = field(default="squares", kw_only=True)
+    residual_modes: bool = field(default=False, kw_only=True)
     site: str = field(init=False, default="?")
 
     def __post_init__(self) -> None:
@@ -55,6 +56,7 @@ class StatedProblem:
         if self.goal is not None:
             as_float("Problem: goal", self.goal, "a positive relative residual", above=0)
         choice("Problem: loss", self.loss, ("squares", "huber"))
+        flag("Problem: residual_modes", self.residual_modes)
         if self.loss == "huber" and self.misfit is not None:
             raise InputError("Problem: loss='huber' is of records, and this problem fits a misfit of its own instead")
         if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
@@ -117,6 +119,7 @@ class StatedProblem:
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
             "loss": self.loss,
+            "residual_modes": self.residual_modes,
         }
 
     @cached_property
@@ -156,7 +159,10 @@ class StatedProblem:
 
     def formulate(self, geometry: Geometry, modal: Sequence[ModalEstimate]) -> Formulation:
         """Matrices, terms and constraints as CasADi functions of the unknowns, for a geometry and modal estimates."""
-        return Formulation(modal, self.models, geometry, self.residuals, self.constraints, self.misfit, self.healing)
+        return Formulation(
+            modal, self.models, geometry, self.residuals, self.constraints, self.misfit, self.healing,
+            residual_modes=self.residual_modes,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         models = ", ".join(type(model).__name__ for model in self.models)

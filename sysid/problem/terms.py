@@ -97,20 +97,27 @@ class TestTerm:
 
     def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
         """Relative residuals of accelerations and, where measured, of the force; modes are read with ratios only."""
+        return self.weight * self.matrices.beyond.of(self.test, self.shift).without_in(self._rows(x, modes))
+
+    def _rows(self, x: ca.MX, modes: ModeSymbols | None) -> ca.MX:
+        """The same before the weight of the test, of the model's own modes alone."""
         motion = self.matrices.motion(x)
         if not self.matrices.by_ratios:
-            return self.weight * relative_misfit(self.test, motion, weighted=True, shift=self.shift)
+            return relative_misfit(self.test, motion, weighted=True, shift=self.shift)
         assert modes is not None
         phi, omega = modes
         ratios = self.matrices.ratio_function(x, omega)
         shapes = ca.DM(motion.recovery) @ phi
-        if self.modal.by_modes and self.modal.omega.size == omega.numel():
-            gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
-            weighed = self.test.force is not None
-            rows = misfit_rows(self.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
-            return self.weight / size * rows
         modes_here = shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass
-        return self.weight * residual(self.test, *modes_here, weighted=True, shift=self.shift)
+        if self.estimate.by_modes and self.estimate.omega.size == omega.numel():
+            size, weighed = weights_of_test(self.test, weighted=True)[0][1], self.test.force is not None
+            return misfit_rows(self.estimate, *modes_here, weighed=weighed) / size
+        return residual(self.test, *modes_here, weighted=True, shift=self.shift)
+
+    @cached_property
+    def estimate(self) -> ModalEstimate:
+        """The estimate of its modes; of lines alone where modes beyond them are fitted, which are not told there."""
+        return ModalEstimate.of_lines(self.test) if self.matrices.beyond.omega.size else self.modal
 
     @cached_property
     def batch(self) -> TestObjective:
@@ -126,7 +133,7 @@ class TestTerm:
         if not self.matrices.by_ratios:
             return float(self._norm(x))
         try:
-            s = self.matrices.structure(x, self.test)
+            s = self.matrices.own_structure(x, self.test)
         except InputError:
             return float("nan")
         return float(self._norm(x, s.normal_modes, 2 * np.pi * s.natural_frequencies))
@@ -150,7 +157,12 @@ class TestTerm:
     ) -> Rows:
         """As in `Term`; `slopes` are those at x where they are known."""
         slopes = slopes or slopes_of(self.matrices, x, self.test)
-        return stacked_rows(rows_of_test(self.modal, slopes, x.size, share=self.weight, as_stated=as_stated))
+        return stacked_rows(self.rows_of(slopes, x.size, as_stated=as_stated))
+
+    def rows_of(self, slopes: Slopes, unknowns: int, *, as_stated: bool = False) -> list[Rows]:
+        """Rows of each record, see `rows_of_test`."""
+        beyond = self.matrices.beyond.of(self.test)
+        return rows_of_test(self.estimate, slopes, unknowns, beyond, share=self.weight, as_stated=as_stated)
 
     def findings(self, x: Array) -> Sequence[Finding]:
         """None of its own: records are checked in `sysid.assessment.checks`."""

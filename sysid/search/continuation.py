@@ -101,7 +101,8 @@ class _Smoother:
 
     @staticmethod
     def _at(term: TestTerm, poles: PolesAndResidues, share: float) -> TestTerm:
-        wide = poles.smoothed(term.test, share)
+        # Poles above the lines are left to residual modes, which are held far from some of them.
+        wide = poles.smoothed(term.test, share, term.test.freq[-1] if term.matrices.beyond.size else np.inf)
         return replace(term, modal=ModalEstimate.of_lines(wide.test), shift=wide.shift)
 
 

@@ -91,32 +91,42 @@ class InverseFactorError:
     """The squared error of a test in the coordinates of this phase, with exact gradient and Hessian.
 
     The coordinates are one column: the entries of R, row by row, P by columns, the entries of N, row by row, where a
-    base force was measured, the entries below the diagonal of the skew-symmetric S, log w (n,) and log zeta (n,).
+    base force was measured, the entries below the diagonal of the skew-symmetric S, those of residual modes, log w (n,)
+    and log zeta (n,). Residual modes, r of them at poles that are held, have shapes (n, r), by columns, and with a base
+    force participations, an upper triangle (d, d) a pole; else these are unit matrices.
 
-    `sizes` tells how many there are of R, P, N, S, and log w with log zeta. Functions of the coordinates and Psi_0
-    (n, n) are `value`, `gradient` (the value beside it), `hessian`, and `modes`: shapes (n, n), participations (n, d)
-    and rigid-body mass (d, d). `totals` takes the entries of R, P and N to what is stated of totals beside a measured
-    base force, each relative to its value and zero where it is met; no rows where nothing is stated.
+    `sizes` tells how many there are of R, P, N, S, of residual modes, and log w with log zeta. Functions of the
+    coordinates and Psi_0 (n, n) are `value`, `gradient` (the value beside it), `hessian`, and `modes`: shapes (n, n),
+    participations (n, d) and rigid-body mass (d, d). `totals` takes the entries of R, P and N to what is stated of
+    totals beside a measured base force, each relative to its value and zero where it is met; no rows where nothing is
+    stated.
     """
 
     def __init__(self, problem: Prepared) -> None:
         test, n, d = problem.measurement, problem.geometry.n, problem.geometry.d
-        weighed = test.force is not None
-        self.sizes = (n * (n + 1) // 2, n * d, weighed * d * (d + 1) // 2, n * (n - 1) // 2, 2 * n)
+        weighed, beyond = test.force is not None, problem.formulation.matrices.beyond
+        omega, ratios = beyond.omega.repeat(d), beyond.ratios.repeat(d)
+        r, corner = omega.size, weighed * d * (d + 1) // 2
+        self.sizes = (n * (n + 1) // 2, n * d, corner, n * (n - 1) // 2, n * r + r // d * corner, 2 * n)
         y, psi_0 = ca.MX.sym("y", sum(self.sizes)), ca.MX.sym("psi_0", n, n)
-        *factors, skew, pole = (ca.MX.sym("part", size) for size in self.sizes)
-        shapes = ca.vertcat(*factors, skew)
+        *factors, skew, others, pole = (ca.MX.sym("part", size) for size in self.sizes)
+        shapes = ca.vertcat(*factors, skew, others)
         R, P, N = _matrices(factors, n, d)
         psi = psi_0 @ cayley(skew_symmetric(skew, n))
         phi, gamma, rigid = R.T @ psi, psi.T @ P, P.T @ P + N @ N.T
         alone, value, gradient, hessian = ca.MX(0), ca.MX(0), ca.MX(y.numel(), 1), ca.MX(y.numel(), y.numel())
-        self._errors = list(_errors_of(test, n))  # which must live as long as the functions made of them
+        blocks = [lower_triangle(one, d).T for one in ca.vertsplit(others[n * r :], corner)] if weighed and r else []
+        every = ca.vertcat(gamma, *blocks) if blocks else ca.vertcat(gamma, ca.DM(np.tile(np.eye(d), (r // d, 1))))
+        at_sensors = ca.horzcat(phi, ca.reshape(others[: n * r], n, r))
+        own = np.eye(2 * (n + r))[:, np.concatenate([np.arange(n), n + r + np.arange(n)])]
+        held = np.concatenate([np.zeros(n), np.log(omega), np.zeros(n), np.log(ratios)])
+        self._errors = list(_errors_of(test, n + r))  # which must live as long as the functions made of them
         for error, of_force in self._errors:
-            moved = ca.veccat(*((gamma.T, rigid) if of_force else (phi,)), gamma)
-            at = ca.vertcat(moved, pole)
+            moved = ca.veccat(*((every.T, rigid) if of_force else (at_sensors,)), every)
+            at = ca.vertcat(moved, ca.DM(own) @ pole + ca.DM(held))
             squared, slope = error.gradient(at)
             # What holds no lines is differentiated as it stands.
-            chain = ca.densify(ca.diagcat(ca.jacobian(moved, shapes), ca.DM.eye(2 * n)))
+            chain = ca.densify(ca.diagcat(ca.jacobian(moved, shapes), ca.DM(own)))
             pull = ca.MX.sym("pull", moved.numel())
             bend = ca.Function("bend", [shapes, psi_0, pull], [ca.hessian(ca.dot(pull, moved), shapes)[0]])
             alone += error.value(at)
@@ -124,7 +134,7 @@ class InverseFactorError:
             gradient += chain.T @ slope
             bent = bend(shapes, psi_0, slope[: moved.numel()])
             hessian += product(product(chain.T, error.hessian(at)), chain) + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
-        parts, given = [*factors, skew, pole], ca.vertsplit(y, np.cumsum([0, *self.sizes]).tolist())
+        parts, given = [*factors, skew, others, pole], ca.vertsplit(y, np.cumsum([0, *self.sizes]).tolist())
 
         def function(name: str, *outputs: ca.MX) -> ca.Function:
             inner = ca.Function(name, [*parts, psi_0], list(outputs))
@@ -186,8 +196,9 @@ def _fit_about(problem: Prepared, x: Array, error: InverseFactorError, monitor: 
     loads = _scaled(z, "load of modes", of_mass[1], size)
     base = _scaled(z, "base mass", of_mass[2], size) if error.sizes[2] else ca.MX(0, 1)
     skew = z.variable("rotation of modes", np.zeros(n * (n - 1) // 2))
+    beyond = [_scaled(z, "residual mode", part, _rms(part)) for part in _residual_of(structure, error) if part.size]
     omega, ratios = spectrum_near(problem, structure, modes_of(structure), z)
-    y = ca.vertcat(inverse, loads, base, skew, ca.log(omega), ca.log(ratios))
+    y = ca.vertcat(inverse, loads, base, skew, *beyond, ca.log(omega), ca.log(ratios))
     objective, derivatives = error.value(y, start.psi), _derivatives(z, y, error, start.psi)
     best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
     rows = error.totals(inverse, loads, base)
@@ -206,6 +217,16 @@ def _fit_about(problem: Prepared, x: Array, error: InverseFactorError, monitor: 
     solved = status in SOLVED or monitor.stopped is not None
     left = "" if solved else _left_in_words(problem, z, derivatives, best)
     return End(found, problem.objective(found), status, z.on_bounds(best), left)
+
+
+def _residual_of(structure: Structure, error: InverseFactorError) -> tuple[Array, Array]:
+    """Entries of the residual modes of a structure: of their shapes, and of their participations with a base force."""
+    beyond, d = structure.residual, structure.n_base
+    loads, shapes = beyond.participation.reshape(-1, d, d), beyond.shapes
+    if not error.sizes[2]:
+        scaled = [shapes[:, i * d : (i + 1) * d] @ load for i, load in enumerate(loads)]
+        return np.hstack([shapes[:, :0], *scaled]).ravel(order="F"), np.zeros(0)
+    return shapes.ravel(order="F"), np.array([triangle_entries(load.T) for load in loads]).ravel()
 
 
 def _rms(values: Array) -> float:

@@ -116,6 +116,7 @@ class Modal:
             (not formulation.stiffness.free and part.stop > part.start, "the stiffness has a form of its own"),
             (not formulation.stiffness.free or not (mass.free or mass.entries is not None), written),
             (not formulation.damping.free, "the damping has a form of its own"),
+            (formulation.residual_modes and not formulation.mass.free, "residual modes are asked for beside that mass"),
             (start is not None, "a start was given"),
         )
         return next((why for applies, why in reasons if applies), None)

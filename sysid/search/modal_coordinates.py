@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one, separate_poles
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
@@ -32,16 +32,18 @@ _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 def fit_in_modes(problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
     """Minimise the objective of a problem with free modes, from the structure of `x`."""
     start = problem.structure(x)
-    first, test = modes_of(start), problem.measurement
+    first, test, own, ties = all_modes_of(start), problem.measurement, slice(start.n), stated_totals(problem)
+    beyond = first.gamma[start.n :]
 
     def attempt(modes: Modes) -> ModalFit:
         return solve_modes(
             problem.modal[0], modes, lambda z: spectrum_near(problem, start, modes, z), unit=np.sqrt(problem.totals),
-            remainder=_remainder(start), ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
+            remainder=_remainder(start) - beyond.T @ beyond, monitor=monitor, max_iterations=max_iterations,
+            ties=ties and (lambda phi, gamma, rigid: ties(phi[:, own], gamma[own, :], rigid)),
         )  # fmt: skip
 
     best, tried = attempt(first), 1
-    for again in _linear_starts(test, best, first):
+    for again in _linear_starts(test, best, first, start.n):
         if monitor.stopped is not None or best.residual <= EXACT or monitor.left < 1.0:
             break
         answer = attempt(again)
@@ -49,27 +51,52 @@ def fit_in_modes(problem: Prepared, x: Array, monitor: IterationMonitor, max_ite
         if answer.residual < best.residual:
             best = answer
     remark = f"best of {tried} starts, as the first ended in a local minimum" if tried > 1 else ""
-    return End(unknowns_of(problem, best.modes, best.rigid, start, x), best.residual, best.status, best.bounds, remark)
+    found = unknowns_of(problem, best.modes.at(own), best.rigid, start, x)
+    return End(found, best.residual, best.status, best.bounds, remark)
 
 
-def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator[Modes]:
-    """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
-    fits = [(poles, *linear_residues(test, poles.omega, poles.ratios)) for poles in (ended.modes, first)]
+def _linear_starts(test: Measurement, ended: ModalFit, first: Modes, own: int) -> Iterator[Modes]:
+    """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones.
+
+    The first modes are a structure's `own`, to which the others are residual ones; these stay, each pole once.
+    """
+    fits = [(poles, *_free_residues(test, poles, own)) for poles in (ended.modes, first)]
     if ended.of_accelerations <= FREE * min(possible for _, _, possible in fits):
         return
     for poles, residues, _ in fits:
-        yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
+        mine = poles.at(slice(own))
+        new = rank_one(residues[:own], mine.omega, mine.ratios, np.linalg.norm(mine.phi, axis=0))
+        yield joined(new, first.at(slice(own, None)))
 
 
-def fits_worse_than_free_residues(test: Measurement, modes: Modes, error: float) -> bool:
+def _free_residues(test: Measurement, modes: Modes, own: int) -> tuple[Array, float]:
+    """Free residues at the poles of a structure's own modes and at each pole of the others; what they leave."""
+    others = modes.at(slice(own, None))
+    poles = joined(modes.at(slice(own)), others.at(separate_poles(others)[0]))
+    residues, left = linear_residues(test, poles.omega, poles.ratios)
+    return residues, float(left)
+
+
+def fits_worse_than_free_residues(test: Measurement, structure: Structure, error: float) -> bool:
     """True where a relative error of the accelerations is clearly above what free residues leave: a local minimum."""
-    return error > max(EXACT, FREE * linear_residues(test, modes.omega, modes.ratios)[1])
+    return error > max(EXACT, FREE * _free_residues(test, all_modes_of(structure), structure.n)[1])
 
 
 def modes_of(structure: Structure) -> Modes:
     """The modes of a structure, rad/s."""
     omega = 2 * np.pi * structure.natural_frequencies
     return Modes(structure.mode_shapes, structure.participation, omega, structure.damping_ratios)
+
+
+def all_modes_of(structure: Structure) -> Modes:
+    """The modes of a structure, then the residual ones."""
+    beyond = structure.residual
+    return joined(modes_of(structure), Modes(beyond.shapes, beyond.participation, beyond.omega, beyond.damping_ratios))
+
+
+def joined(modes: Modes, others: Modes) -> Modes:
+    """Modes, and others behind them."""
+    return Modes(np.hstack([modes.phi, others.phi]), *map(np.concatenate, zip(modes[1:], others[1:], strict=True)))
 
 
 def frequencies(problem: Prepared, start: Array, z: NonlinearProgram, *, near: bool = True) -> tuple[ca.MX, Array]:
@@ -83,17 +110,24 @@ def frequencies(problem: Prepared, start: Array, z: NonlinearProgram, *, near: b
 
 
 def spectrum_near(problem: Prepared, structure: Structure, start: Modes, z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
-    """Circular frequencies and damping ratios as expressions of new unknowns: log w near what is stated, log zeta."""
-    formulation = problem.formulation
+    """Circular frequencies and damping ratios as expressions of new unknowns: log w near what is stated, log zeta.
+
+    Of the structure's own modes, the first of `start`; those of residual ones are held.
+    """
+    n, formulation = structure.n, problem.formulation
+    held = start.at(slice(n, None))
+    start = start.at(slice(n))
     omega, _ = frequencies(problem, start.omega, z)
     damping, unknowns = formulation.models[2], formulation.of_models[2]
     lower, upper = lower_of(unknowns), upper_of(unknowns)
     if formulation.damping.free:
         guess = np.clip(start.ratios, lower, upper)
         low, high = np.log(lower / guess), np.log(upper / guess)
-        return omega, ca.DM(guess) * ca.exp(z.variable(unknowns[0].title, np.zeros(guess.size), low, high))
-    guess = np.clip(damping.values(formulation.geometry, structure), lower, upper)
-    return omega, formulation.ratios(add_unknowns(z, unknowns, guess), omega)
+        ratios = ca.DM(guess) * ca.exp(z.variable(unknowns[0].title, np.zeros(guess.size), low, high))
+    else:
+        guess = np.clip(damping.values(formulation.geometry, structure), lower, upper)
+        ratios = formulation.ratios(add_unknowns(z, unknowns, guess), omega)
+    return ca.vertcat(omega, ca.DM(held.omega)), ca.vertcat(ratios, ca.DM(held.ratios))
 
 
 def unknowns_of(problem: Prepared, modes: Modes, rigid: Array, start: Structure, x: Array) -> Array:

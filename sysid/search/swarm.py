@@ -16,7 +16,7 @@ from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
 from sysid.search.local import Coordinates
-from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
+from sysid.search.modal_coordinates import fits_worse_than_free_residues
 from sysid.search.session import Part, Session, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
 from sysid.search.swarm_objective import WORST, RefineBy, Refiner, SwarmObjective, Tally
@@ -148,11 +148,15 @@ class Swarm:
                 "total_mass only, or take strategy 'modal'"
             )
         n, poles = problem.geometry.n, problem.poles
-        if poles is None or poles.omega.size <= n:
+        # What stands out above the lines is a residual mode where modes are free, or these are asked for.
+        beyond = problem.free_modes or problem.formulation.residual_modes
+        last = 2 * np.pi * problem.measurement.freq[-1] if beyond else np.inf
+        omega = np.zeros(0) if poles is None else poles.omega[poles.omega <= last]
+        if omega.size <= n:
             return None
-        found = ", ".join(f"{w / (2 * np.pi):.4g}" for w in poles.omega)
+        found = ", ".join(f"{w / (2 * np.pi):.4g}" for w in omega)
         return (
-            f"{poles.omega.size} modes stand out of the data ({found} Hz) for {n} sensors, but the swarm's models have "
+            f"{omega.size} modes stand out of the data ({found} Hz) for {n} sensors, but the swarm's models have "
             "one a sensor: narrow the band, or use strategy 'modal'"
         )
 
@@ -401,7 +405,7 @@ class _Search:
 
     def _in_local_minimum(self) -> bool:
         test, structure = self.problem.measurement, self.problem.structure(self.found)
-        return fits_worse_than_free_residues(test, modes_of(structure), error_of_accelerations(test, structure))
+        return fits_worse_than_free_residues(test, structure, error_of_accelerations(test, structure))
 
 
 class _SwarmRecord:

@@ -49,6 +49,8 @@ def held_spectrum_objective(
     """
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
+    if not term.matrices.beyond.of(term.test).by_channel:
+        return None
     s, matrices = ca.MX.sym("s", problem.n_variables), term.matrices
     x = unknowns(s)
     parts = [matrices.ratio_function(x, ca.DM(np.sort(spectrum))), *matrices.of_modes(x)]
@@ -78,11 +80,13 @@ class HeldSpectrumObjective:
         sizes: list[tuple[float, float]] = []
         scales = weights_of_test(test, weighted=True)
         every = zip(self._records, records_of(test), scales, recovery, strict=False)
+        beyond = term.matrices.beyond.of(test, term.shift).functions
         for summed, (record, std), (_, scale), seen in every:
             static = summed is self._records[1]
             for runs, channel, line in products(std, record.shape):
                 of_runs = record[runs], test.base[runs], channel, line
-                summed.append((SummedRecord(*of_runs, seen, self._series, static=static), scale**2))
+                one = SummedRecord(*of_runs, seen, self._series, static=static, beyond=beyond)
+                summed.append((one, scale**2))
             sizes.append((weights_of(record, std)[1], scale))
         # Where less than this is left, lines are summed: the difference of large numbers that stands for the square has
         # lost half of its digits there. A record that weighs more than the accelerations loses its digits earlier.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,15 +139,7 @@ class Structure:
         self.sensors = checked_sensors(sensors)
         if self.sensors is not None and len(self.sensors) != self.n_sensors:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
-        self.residual = residual or ResidualModes.none(self.n_sensors, self.n_base)
-        shape = len(self.residual.shapes), self.residual.participation.shape[1]
-        refuse(
-            (
-                shape != (self.n_sensors, self.n_base),
-                f"the residual modes are of {shape[0]} sensors and {shape[1]} base directions, the structure of "
-                f"{self.n_sensors} and {self.n_base}",
-            )
-        )
+        self._set_residual(residual or ResidualModes.none(self.n_sensors, self.n_base))
 
         G = self.rigid_body_dofs
         B = self.mass[:n, :n] @ G + self.mass[:n, n:]
@@ -156,6 +149,18 @@ class Structure:
         self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
         self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
         self._coupling = B
+
+    def _set_residual(self, residual: ResidualModes) -> None:
+        theirs, ours = (len(residual.shapes), residual.participation.shape[1]), (self.n_sensors, self.n_base)
+        words = "the residual modes are of {} sensors and {} base directions, the structure of {} and {}"
+        refuse((theirs != ours, words.format(*theirs, *ours)))
+        self.residual = residual
+
+    def with_residual(self, residual: ResidualModes) -> Structure:
+        """The same structure with these residual modes in the place of its own."""
+        other = copy(self)
+        other._set_residual(residual)
+        return other
 
     def to_tree(self) -> dict[str, Any]:
         """Arguments of the constructor as a dictionary of numbers and arrays, for `from_tree`."""

@@ -31,8 +31,8 @@ class ResidualModes:
     participation : (r, d)
         kg^1/2 (kg^1/2 m for a rotation of the base).
     static : int
-        So many, the last, stand at one frequency that was chosen, not found: they hold the static answer of all modes
-        above the band.
+        So many, the last, stand at frequencies that are held in the fit: they hold the answer, nearly static, of all
+        modes above the band.
 
     Raises
     ------

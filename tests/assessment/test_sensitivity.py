@@ -119,7 +119,8 @@ def test_rows_of_a_test_are_weighted_residuals_and_their_central_differences(by_
     problem, x = general(by_ratios, recovery=recovery)
     test = problem.measurement
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    accelerations, forces = rows_of_test(ModalEstimate.of_lines(test), slopes, x.size)
+    none = problem.formulation.matrices.beyond
+    accelerations, forces = rows_of_test(ModalEstimate.of_lines(test), slopes, x.size, none)
 
     def left(predict, record):
         def residual(y):

@@ -69,7 +69,7 @@ def test_the_square_is_that_of_the_difference_at_all_lines(base, static):
         loads = np.concatenate([loads, rigid], axis=1)
     record = made[0] * 1.1
     series = GainSeries(FREQ, OMEGA, LOW, HIGH)
-    summed = SummedRecord(record, u, channel, line, recovery, series, static=static)
+    summed = SummedRecord(record, u, channel, line, recovery, series, static=static, beyond=np.zeros((0, *line.shape)))
     weight = channel[:, None] * line[:, None]
     expected = np.sum(np.abs(weight * (made - record)) ** 2, axis=(1, 2, 3))
     squared = summed.squared(shapes, loads, series.polynomials(ratios.T))

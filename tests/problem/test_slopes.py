@@ -220,7 +220,7 @@ def test_rows_of_whole_records_are_those_of_their_modes(kind, damping, force):
     modal = with_modes_of_records(problem.measurement, problem.structure(x), np.random.default_rng(3))
     test = modal.records
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    (rows,) = rows_of_test(modal, slopes, x.size, share=0.7, as_stated=True)
+    (rows,) = rows_of_test(modal, slopes, x.size, problem.formulation.matrices.beyond, share=0.7, as_stated=True)
     off = lambda x: off_the_modes(modal, problem.structure(x))  # noqa: E731
     expected = np.column_stack([off(x), differences(lambda x: [off(x)], x)[0] * np.abs(x)])
     made = np.column_stack([rows.residuals, rows.jacobian * np.abs(x)])
@@ -248,5 +248,6 @@ def test_deviations_of_whole_records_grow_with_what_is_left_beyond_the_stated_no
     test = replace(test, response=relative + np.einsum("sd,rdf->rsf", G, base), force=force)
     modal = with_modes_of_records(test, structure, rng)
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    (found,), (stated,) = (rows_of_test(modal, slopes, 1, as_stated=flag) for flag in (False, True))
+    none = problem.formulation.matrices.beyond
+    (found,), (stated,) = (rows_of_test(modal, slopes, 1, none, as_stated=flag) for flag in (False, True))
     np.testing.assert_allclose(found.std / stated.std, times, rtol=0.08)

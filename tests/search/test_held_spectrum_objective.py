@@ -43,7 +43,7 @@ def measured(structure, base="unit", *, force=False, noise=False):
     return sysid.Measurement(FREQ, u, absolute, rigid_body=structure.rigid_body, force=of_base, **std)
 
 
-def problem(base="unit", *, healing="trace", total=True, rigid_body=G, given=N, **records):
+def problem(base="unit", *, healing="trace", total=True, rigid_body=G, given=N, residual_modes=False, **records):
     structure = truth(rigid_body)
     mass = sysid.FullMass(np.diag(structure.rigid_body_mass) if total else None, healing=healing)
     return sysid.Problem(
@@ -51,6 +51,7 @@ def problem(base="unit", *, healing="trace", total=True, rigid_body=G, given=N, 
         mass=mass,
         stiffness=sysid.SpectralStiffness(structure.natural_frequencies[:given], max_frequency=21.0),
         damping=sysid.ModalDamping(0.005, 0.05),
+        residual_modes=residual_modes,
     )
 
 
@@ -83,6 +84,9 @@ def by_lines(made, cost, rows):
         {"base": "three runs"},
         {"base": "loud and quiet"},
         {"base": "loud and quiet", "noise": True, "force": True},
+        {"residual_modes": True},
+        {"residual_modes": True, "base": "one run", "noise": True},
+        {"residual_modes": True, "base": "loud and quiet"},
     ],
     ids=str,
 )

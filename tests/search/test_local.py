@@ -276,7 +276,7 @@ class TestStarts:
         ended = first._replace(omega=1.3 * first.omega)
         left = linear_residues(test, ended.omega, ended.ratios)[1]
         assert left > 0.1
-        own, other = _linear_starts(test, SimpleNamespace(modes=ended, of_accelerations=left), first)
+        own, other = _linear_starts(test, SimpleNamespace(modes=ended, of_accelerations=left), first, truth.n)
         np.testing.assert_array_equal(own.omega, ended.omega)
         np.testing.assert_array_equal(other.omega, first.omega)
         residues = np.einsum("nk,kd->knd", other.phi, other.gamma)
@@ -291,7 +291,7 @@ class TestStarts:
         ]
         monkeypatch.setattr("sysid.search.modal_coordinates.solve_modes", lambda *args, **options: ends.pop(0))
         monkeypatch.setattr(
-            "sysid.search.modal_coordinates._linear_starts", lambda test, best, first: iter([first, first])
+            "sysid.search.modal_coordinates._linear_starts", lambda test, best, first, own: iter([first, first])
         )
         end = fit_in_modes(problem.prepared, problem.values(truth), IterationMonitor(None, None), 1)
         assert not ends
