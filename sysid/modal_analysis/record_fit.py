@@ -319,7 +319,7 @@ class _Equations:
 
     def __call__(self, p: Parameters, levels: Array, near: float = 0.2) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
-        if self.at is not None and _moved(self.at[0].modes, p.modes) + _largest(levels / self.at[1]) < near:
+        if self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
@@ -332,11 +332,19 @@ class _Equations:
         return None if self.at is not None and self.at[0] is p else self(p, levels, near=0.0)
 
 
-def _moved(modes: Modes, other: Modes) -> float:
-    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape."""
+def _moved(before: Parameters, after: Parameters) -> float:
+    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape.
+
+    And of couplings, over the losses of the modes.
+    """
+    modes, other = before.modes, after.modes
+    loss = np.sqrt(2 * modes.ratios * modes.omega)
+    coupled = 0.0
+    if before.coupling is not None and after.coupling is not None:
+        coupled = np.abs((after.coupling - before.coupling) / np.outer(loss, loss)).max()
     turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
     pole = np.abs(np.log(other.omega / modes.omega)) / modes.ratios
-    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios)))
+    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios), coupled))
 
 
 def _largest(ratios: Array) -> float:

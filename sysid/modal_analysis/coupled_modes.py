@@ -1,0 +1,69 @@
+"""Modes that dampers couple, as a dashpot between two floors does: where the records ask for the couplings, and values.
+
+The off-diagonal entries Z of ``Phi' C Phi`` make mode shapes complex: to first order that of mode k is
+``phi_k + sum_j i w_k Z_jk phi_j / (w_k² - w_j²)``, so that residues have a part in quadrature, which further modes
+beside each peak would mimic. The model holds Z itself, exact for any size of it and for close modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_model import NormalEquations, Parameters
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.record_model import RecordModel
+from sysid.measurement.measurement import Measurement
+from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF, beyond_chance
+
+
+def uncoupled(p: Parameters) -> Parameters:
+    """The same parameters with couplings that are free, and zero."""
+    return replace(p, coupling=np.zeros((p.modes.omega.size,) * 2))
+
+
+def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[float, int]:
+    """Fall of twice the sum of squares that couplings promise in one step (Rao 1948), and how many show."""
+    N, size = unit_diagonal(equations.normal)
+    gradient, own = equations.gradient / size, np.zeros(model.size, bool)
+    own[model.coupling] = True
+    half = half_inverse(N[np.ix_(~own, ~own)], ROUND_OFF)
+    across = half.T @ N[np.ix_(~own, own)]
+    left = gradient[own] - across.T @ (half.T @ gradient[~own])
+    lam, V = np.linalg.eigh(N[np.ix_(own, own)] - across.T @ across)
+    seen = lam > ROUND_OFF
+    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
+
+
+def passive(p: Parameters) -> bool:
+    """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite."""
+    assert p.coupling is not None
+    loss = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2
+    return bool(np.linalg.eigvalsh(loss)[0] >= 0)
+
+
+def with_couplings(
+    fit: RecordFit, pruned: Callable[[RecordFit], RecordFit], *, monitor: FitMonitor, some: Measurement | None = None
+) -> RecordFit:
+    """The fit with couplings of its modes, where the records ask for them beyond chance; `some` as in `refitted`.
+
+    Modes that stood for couplings leave nothing else to determine: `pruned` takes them out of a rough fit.
+    """
+    first = uncoupled(fit.parameters)
+    model = fit.model_of(first)
+    if fit.parameters.coupling is not None or not len(model.coupled):
+        return fit
+    beyond = max(fit.reduced, 1.0)
+    promised, count = score_of_couplings(model, model.normal_equations(first, fit.levels))
+    if promised < beyond * beyond_chance(count):
+        return fit
+    monitor.doing = f"{fit.model.m} modes and the dampers between them"
+    rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor))
+    more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
+    gained = 2 * (more.likelihood - fit.likelihood)
+    least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
+    return more if more.settled and passive(more.parameters) and gained > beyond * least else fit
