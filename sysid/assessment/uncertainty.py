@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.assessment.checks.gains import GainErrors, gain_errors
 from sysid.assessment.information import (
@@ -40,7 +40,13 @@ from sysid.assessment.sensitivity import (
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
 from sysid.modal_analysis.misfit import inflation_of, noise_records
-from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
+from sysid.modal_analysis.modal_estimate import (
+    ModalEstimate,
+    coupling_about,
+    independent_rows,
+    information_about,
+    shifts_about,
+)
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
@@ -226,14 +232,16 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
+    normals, coupling, coupled = _coupled(problem.modal[0], modes, own, inflation, normals, unseen)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     mine = modes.at(own)
-    matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, mine, moves.of(own))]
+    changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
+    matrices = [moves.std(change, size) for change, size in changes]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = [open_, open_, open_]  # zeros that a decoupled structure keeps included
     by_gains = Perturbations(0, *index.split(shifts))
-    mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own)))
+    mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own), coupling, coupled))
     by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))
     spectra = ModalSpectra(modes, moves, structure.rigid_body_mass)
     found = _quantities(problem, structure, mine, moves.of(own), inflation, matrices, by_gain, spectra)
@@ -243,6 +251,24 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     known = of_outside(problem.formulation, x)
     std = std_of(known.steps, known.rank, known.unit)
     return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
+
+
+def _coupled(
+    modal: ModalEstimate, modes: Modes, own: NDArray[np.bool_], inflation: float, normals: Array, unseen: Array
+) -> tuple[Array, Array, Array]:
+    """Moves with those of couplings by dampers beside, the couplings of one's `own` modes (n, n), and their changes."""
+    found, n = coupling_about(modal, modes), np.count_nonzero(own)
+    if found is None:
+        return normals, np.zeros((n, n)), np.zeros((n, n, normals.shape[1] + unseen.shape[1]))
+    lam, V = np.linalg.eigh(found.covariance)
+    alone = inflation * V * np.sqrt(np.maximum(lam, 0.0))
+    change = np.hstack([found.follows @ normals, alone, found.follows @ unseen])
+    inside, place = np.all(own[found.pairs], axis=1), np.cumsum(own) - 1
+    coupled: Array = np.zeros((n, n, change.shape[1]))
+    first, second = place[found.pairs[inside]].T
+    coupled[first, second] = coupled[second, first] = change[inside]
+    wider = np.hstack([normals, np.zeros((len(normals), lam.size))])
+    return wider, found.values[np.ix_(own, own)], coupled
 
 
 def moves_by_records(

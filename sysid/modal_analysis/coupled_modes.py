@@ -11,12 +11,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, half_inverse, refitted, unit_diagonal
 from sysid.modal_analysis.record_model import RecordModel
-from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
@@ -67,3 +69,29 @@ def with_couplings(
     gained = 2 * (more.likelihood - fit.likelihood)
     least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
     return more if more.settled and passive(more.parameters) and gained > beyond * least else fit
+
+
+def coupling_of(
+    model: RecordModel, p: Parameters, normal: Array, order: NDArray[np.intp], at: NDArray[np.intp], beyond: float
+) -> Coupling | None:
+    """Couplings at the end of a fit, of modes and unknowns of `Index` in this order; None where they mean nothing.
+
+    `normal` is the normal matrix of all unknowns, `beyond` the reduced chi-squared.
+    """
+    if p.coupling is None or not model.force:
+        return None
+    N, size = unit_diagonal(normal)
+    kept, own = np.arange(model.kept), np.arange(model.coupling.start, model.coupling.stop)
+    others = np.arange(model.kept, model.coupling.start)
+    half = half_inverse(N[np.ix_(others, others)], ROUND_OFF)
+    turned = half.T @ N[others]
+    N = N - turned.T @ turned
+    inverse = half_inverse(N[np.ix_(own, own)], ROUND_OFF)
+    inverse = inverse @ inverse.T
+    follows = np.zeros((own.size, model.index.size))
+    follows[:, kept] = -(inverse @ N[np.ix_(own, kept)]) / size[own, None] * size[kept]
+    covariance = max(beyond, 1.0) / 2 * inverse / np.outer(size[own], size[own])
+    place = np.argsort(order)
+    return Coupling(
+        p.coupling[np.ix_(order, order)], np.sort(place[model.coupled], axis=1), follows[:, at], covariance
+    )  # fmt: skip
