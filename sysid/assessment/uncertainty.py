@@ -39,9 +39,10 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
+from sysid.modal_analysis.coupled_spectra import coupling_information
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import (
-    ModalEstimate,
+    Coupling,
     coupling_about,
     independent_rows,
     information_about,
@@ -225,14 +226,14 @@ def uncertainty(
 def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: GainErrors) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
-    modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
+    modes, index, inflation, normals, unseen, shifts, found = moves_by_records(problem, structure, gains=True)
     own = np.isin(modes.omega, separated_modes(structure).omega)
     possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
-    normals, coupling, coupled = _coupled(problem.modal[0], modes, own, inflation, normals, unseen)
+    normals, coupling, coupled = _coupled(found, own, inflation, normals, unseen)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     mine = modes.at(own)
     changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
@@ -254,10 +255,10 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
 
 
 def _coupled(
-    modal: ModalEstimate, modes: Modes, own: NDArray[np.bool_], inflation: float, normals: Array, unseen: Array
+    found: Coupling | None, own: NDArray[np.bool_], inflation: float, normals: Array, unseen: Array
 ) -> tuple[Array, Array, Array]:
     """Moves with those of couplings by dampers beside, the couplings of one's `own` modes (n, n), and their changes."""
-    found, n = coupling_about(modal, modes), np.count_nonzero(own)
+    n = np.count_nonzero(own)
     if found is None:
         return normals, np.zeros((n, n)), np.zeros((n, n, normals.shape[1] + unseen.shape[1]))
     lam, V = np.linalg.eigh(found.covariance)
@@ -273,10 +274,11 @@ def _coupled(
 
 def moves_by_records(
     problem: Prepared, structure: Structure, *, gains: bool = False
-) -> tuple[Modes, Index, float, Array, Array, Array]:
+) -> tuple[Modes, Index, float, Array, Array, Array, Coupling | None]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
-    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
+    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it. At last
+    the couplings of these modes by dampers, and how they move.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
     if modal.by_modes and modal.static:  # which turns change nothing holds where their information was taken
@@ -287,11 +289,15 @@ def moves_by_records(
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B, spectra = noise_records(test, structure, unknowns), None, None
-    if modal.by_modes:
+    found = coupling_about(modal, modes) if modal.of_records else None
+    if modal.of_records:
         A, B = information_about(modal, modes)
     else:
         spectra = spectra_of(test, modes)
         A = information(modes, index, [record.grams(spectra) for record in records])
+        if not structure.modal_damping:
+            coupling, rigid = _coupling_of(structure), structure.rigid_body_mass
+            A, found = coupling_information(test, records, modes, rigid, coupling, structure.residual.static)
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
@@ -304,7 +310,15 @@ def moves_by_records(
             pulls = A @ shifts_about(modal, modes)
         plain = normals if B is None else spread(A, None, path)[0]
         shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
-    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts
+    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts, found
+
+
+def _coupling_of(structure: Structure) -> Array:
+    """Off-diagonal entries of ``Phi' C Phi`` of all modes, those of residual ones among them zero, (m, m)."""
+    own, beyond = structure.natural_frequencies, structure.residual.natural_frequencies
+    order = np.argsort(np.concatenate([own, beyond]), kind="stable")
+    coupling = np.pad(structure.modal_damping_matrix - np.diag(np.diag(structure.modal_damping_matrix)), (0, beyond.size))
+    return coupling[np.ix_(order, order)]
 
 
 def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:

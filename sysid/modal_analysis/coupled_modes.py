@@ -72,11 +72,11 @@ def with_couplings(
 
 
 def coupling_of(
-    model: RecordModel, p: Parameters, normal: Array, order: NDArray[np.intp], at: NDArray[np.intp], beyond: float
+    model: RecordModel, p: Parameters, normal: Array, order: NDArray[np.intp], at: NDArray[np.intp]
 ) -> Coupling | None:
     """Couplings at the end of a fit, of modes and unknowns of `Index` in this order; None where they mean nothing.
 
-    `normal` is the normal matrix of all unknowns, `beyond` the reduced chi-squared.
+    `normal` is the normal matrix of all unknowns.
     """
     if p.coupling is None or not model.force:
         return None
@@ -90,7 +90,7 @@ def coupling_of(
     inverse = inverse @ inverse.T
     follows = np.zeros((own.size, model.index.size))
     follows[:, kept] = -(inverse @ N[np.ix_(own, kept)]) / size[own, None] * size[kept]
-    covariance = max(beyond, 1.0) / 2 * inverse / np.outer(size[own], size[own])
+    covariance = inverse / 2 / np.outer(size[own], size[own])
     place = np.argsort(order)
     return Coupling(
         p.coupling[np.ix_(order, order)], np.sort(place[model.coupled], axis=1), follows[:, at], covariance

@@ -265,6 +265,6 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
-        record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at, fit.reduced),
+        record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

@@ -184,6 +184,11 @@ class ModalEstimate:
         return self.information.size > 0
 
     @property
+    def of_records(self) -> bool:
+        """True where these are the statistics of whole records."""
+        return self.by_modes and self.given.whole is not None
+
+    @property
     def stopped(self) -> bool:
         """True where the search for modes was stopped, so that not all were tried."""
         return self.record_fit is not None and self.record_fit.stopped

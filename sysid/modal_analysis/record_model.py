@@ -119,8 +119,13 @@ class RecordModel(SpectralModel):
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self.n_ends = m * 2 * len(self.moving)
-        n_traces = test.n_runs * self.channels * TRACES
+        self._place(static, TRACES, gains=gains, coupled=coupled)
+
+    def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
+        """Set where the unknowns stand; `traces` is how many a channel and run has."""
+        test, m = self.test, self.m
+        self.traces, self.n_ends = traces, m * 2 * len(self.moving)
+        n_traces = test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
         self.coupling = slice(self.kept + self.n_ends + n_traces, self.kept + self.n_ends + n_traces + len(self.coupled))
         self.n_fit = self.coupling.stop
@@ -180,7 +185,7 @@ class RecordModel(SpectralModel):
         omega, ratios = np.exp(np.clip(log_omega, -FAR, FAR)), np.exp(np.clip(log_ratios, -FAR, FAR))
         modes = Modes(phi, gamma, omega, ratios)
         ends, traces = np.split(x[self.kept : self.coupling.start], [self.n_ends])
-        shape = (len(self.whole.samples), self.channels, TRACES)
+        shape = (self.test.n_runs, self.channels, self.traces)
         coupling = None
         if len(self.coupled):
             coupling = np.zeros((self.m, self.m))

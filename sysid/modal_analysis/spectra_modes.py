@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.coupled_spectra import with_couplings_of_lines
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import STATIC_POLE, ModalFit, Modes, Weights, separate_poles, too_few, weigh
 from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
@@ -80,9 +81,10 @@ def fit_modes_of_lines(
         found = fit.with_static(found)
     found = fit.with_weights_of_runs(found, pruned=count is None)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
-    return replace(
+    modal = replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
     )  # fmt: skip
+    return with_couplings_of_lines(modal, monitor, max_iterations)
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,7 @@ def _misfit(
 def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
     """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test = modal.records
-    if modal.by_modes:  # beside the noise of the base, which biases what follows
+    if modal.of_records:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
     else:
         found = _along_the_base(test, records, free)
