@@ -17,7 +17,7 @@ from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import columns, coupled_flexibility, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import round_off
+from sysid.structure.thresholds import ROUND_OFF, round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +208,15 @@ class ModalEstimate:
     def modes(self) -> Modes:
         """The likeliest modes."""
         return Modes(self.phi, self.gamma, self.omega, self.ratios)
+
+    @property
+    def coupling_std(self) -> Array:
+        """Standard deviations of the couplings, (k,), rad/s, of all errors together."""
+        assert self.coupling is not None
+        size = np.sqrt(np.maximum(np.diag(self.information), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(self.information / np.outer(size, size), rcond=ROUND_OFF, hermitian=True)
+        turned = self.coupling.follows / size
+        return np.sqrt(np.diag(self.coupling.covariance + turned @ inverse @ turned.T / 2))
 
     def at(self, kept: NDArray[np.bool_]) -> ModalEstimate:
         """The estimate of some of the modes, (m,), whatever the others are: those of whole records."""
