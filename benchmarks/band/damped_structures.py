@@ -18,7 +18,8 @@ import sysid
 from benchmarks.band.structures import log_uniform
 from benchmarks.records.simulated import random_motion
 
-QUADRATURE = (0.003, 0.05)  # of the residues: norm of imaginary parts over that of real ones
+QUADRATURE = (0.003, 0.05)  # of the residue of the mode that has most: norm of imaginary parts over that of real ones
+VISIBLE = 0.002  # of the rigid-body mass, that each mode has at least
 NOISE = (0.003, 0.01)
 FLOORS = (3, 8)
 RATIOS = (0.008, 0.02)
@@ -41,7 +42,8 @@ class Damped:
     noise : float
         Over each channel's rms.
     quadrature : float
-        Norm of the imaginary parts of the residues over that of the real ones; zero where the damping is classical.
+        Of the residue of the mode that has most, norm of imaginary parts over that of real ones; zero where the damping
+        is classical.
     records : bool
         Whole records, else spectra.
     """
@@ -84,7 +86,7 @@ class Damped:
 
 
 def residues_in_quadrature(M: np.ndarray, K: np.ndarray, C: np.ndarray, B: np.ndarray) -> float:
-    """Norm of the residues in quadrature over that of the others, from the poles of the state matrix."""
+    """Largest norm of a mode's residue in quadrature over that of the rest, from the poles of the state matrix."""
     n, inverse = len(M), np.linalg.inv(M)
     state = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ K, -inverse @ C]])
     poles, right = np.linalg.eig(state)
@@ -92,44 +94,47 @@ def residues_in_quadrature(M: np.ndarray, K: np.ndarray, C: np.ndarray, B: np.nd
     up = poles.imag > 0
     # Those of classical damping have one angle each, which only the origin of phases sets.
     residues = np.einsum("k,ik,kd->kid", poles[up], right[:n, up], left[up][:, n:] @ inverse @ B)
-    turned = [np.exp(-0.5j * np.angle(np.sum(one**2))) for one in residues]
-    residues = residues * np.array(turned)[:, None, None]
-    return float(np.linalg.norm(residues.imag) / np.linalg.norm(residues.real))
+    turned = [one * np.exp(-0.5j * np.angle(np.sum(one**2))) for one in residues]
+    return float(max(np.linalg.norm(one.imag) / np.linalg.norm(one.real) for one in turned))
 
 
 def damped(number: int, *, classical: bool = False) -> Damped:
     """The structure of this number: floors in one or two directions, springs between them; or its classical twin."""
     rng = np.random.default_rng((number, 27))
     n, d = int(rng.integers(FLOORS[0], FLOORS[1] + 1)), 1 + number % 2
-    G = np.zeros((n, d))
-    G[np.arange(n), np.arange(n) % d] = 1.0
-    masses = rng.uniform(0.7, 1.3, n) * 100
-    M_SS = np.diag(masses)
+    G = np.eye(d)[np.arange(n) % d]
+    goal, noise = (float(log_uniform(rng, ends)) for ends in (QUADRATURE, NOISE))
+    least = 0.0
+    while least < VISIBLE:
+        mass, K = _matrices(rng, G)
+        M = mass[:n, :n]
+        squares, phi = scipy.linalg.eigh(K, M)
+        rigid = np.trace(mass) / d
+        least = float(np.min(np.max((phi.T @ M @ G) ** 2, axis=1)) / rigid)
+    P = phi.T @ M
+    C = P.T @ np.diag(2 * rng.uniform(*RATIOS, n) * np.sqrt(squares)) @ P
+    at = int(rng.integers(d, n))
+    dashpot = np.outer(*(2 * [np.eye(n)[at] - np.eye(n)[at - d]]))
+    size = 0.0
+    if not classical:
+        size = scipy.optimize.brentq(lambda c: residues_in_quadrature(M, K, C + c * dashpot, M @ G) - goal, 0.0, 2e3)
+    stiffness = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+    return Damped(mass, stiffness, C + size * dashpot, G, noise, 0.0 if classical else goal, number % 4 >= 2)
+
+
+def _matrices(rng: np.random.Generator, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Masses of floors and base, (n + d, n + d), and K_SS: each floor on the one below it in its direction."""
+    n, d = G.shape
+    mass = np.diag(np.concatenate([rng.uniform(70, 130, n), rng.uniform(30, 60, d)]))
     K, springs = np.zeros((n, n)), rng.uniform(0.7, 1.4, n) * 2e5
     springs[1::2] *= 1.7 if d == 2 else 1.0
-    for i, spring in enumerate(springs):  # each floor on the one below it in its direction
+    for i, spring in enumerate(springs):
         one = np.eye(n)[i] - (np.eye(n)[i - d] if i >= d else 0.0)
         K += spring * np.outer(one, one)
         if d == 2:  # columns out of the centre
             both = np.eye(n)[i] + np.eye(n)[(i + 1) % n]
             K += ECCENTRIC * spring * np.outer(both, both)
-    base = np.diag(rng.uniform(30, 60, d))
-    mass = np.block([[M_SS, np.zeros((n, d))], [np.zeros((d, n)), base]])
-    stiffness = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
-    squares, phi = scipy.linalg.eigh(K, M_SS)
-    P = phi.T @ M_SS
-    C = P.T @ np.diag(2 * rng.uniform(*RATIOS, n) * np.sqrt(squares)) @ P
-    between = np.zeros(n)
-    at = int(rng.integers(d, n))
-    between[[at, at - d]] = 1.0, -1.0
-    goal, noise = (float(log_uniform(rng, ends)) for ends in (QUADRATURE, NOISE))
-    dashpot = np.outer(between, between)
-    size = 0.0
-    if not classical:
-        size = scipy.optimize.brentq(
-            lambda c: residues_in_quadrature(M_SS, K, C + c * dashpot, M_SS @ G) - goal, 0.0, 2e3
-        )
-    return Damped(mass, stiffness, C + size * dashpot, G, noise, 0.0 if classical else goal, number % 4 >= 2)
+    return mass, K
 
 
 def test_of(structure: Damped, number: int) -> sysid.Measurement:
