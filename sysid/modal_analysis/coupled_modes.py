@@ -17,15 +17,20 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.model_order import least_worth
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    RecordFit,
+    half_inverse,
+    refitted,
+    unit_diagonal,
+    without,
+    worth,
+)
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
-
-
-def uncoupled(p: Parameters) -> Parameters:
-    """The same parameters with couplings that are free, and zero."""
-    return replace(p, coupling=np.zeros((p.modes.omega.size,) * 2))
 
 
 def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[float, int]:
@@ -55,17 +60,23 @@ def with_couplings(
 
     Modes that stood for couplings leave nothing else to determine: `pruned` takes them out of a rough fit.
     """
-    first = uncoupled(fit.parameters)
-    model = fit.model_of(first)
-    if fit.parameters.coupling is not None or not len(model.coupled):
+    p, m = fit.parameters, fit.model.m
+    if p.coupling is not None or m - fit.static < 2:
         return fit
-    beyond = max(fit.reduced, 1.0)
-    promised, count = score_of_couplings(model, model.normal_equations(first, fit.levels))
+    model, beyond = RecordModel(fit.test, m, static=fit.static, coupled=True), max(fit.reduced, 1.0)
+    promised, count = score_of_couplings(model, model.normal_equations(p, fit.levels))
     if promised < beyond * beyond_chance(count):
         return fit
-    monitor.doing = f"{fit.model.m} modes and the dampers between them"
+    first = replace(p, coupling=np.zeros((m, m)))
+    monitor.doing = f"{m} modes and the dampers between them"
     rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor))
     more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
+    while more.model.m > 2:  # one that stood for couplings may be worth much beside these, until the others have moved
+        poorest = np.arange(more.model.m) == np.argmin(worth(more))
+        fewer = refitted(more, without(more, poorest), some=some, limits=TRIAL, monitor=monitor)
+        if not fewer.settled or more.likelihood - fewer.likelihood > least_worth(more.model):
+            break
+        more = fewer
     gained = 2 * (more.likelihood - fit.likelihood)
     least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
     return more if more.settled and passive(more.parameters) and gained > beyond * least else fit

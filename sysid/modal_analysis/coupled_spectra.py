@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.coupled_modes import coupling_of, passive, score_of_couplings, uncoupled
+from sysid.modal_analysis.coupled_modes import coupling_of, passive, score_of_couplings
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise
 from sysid.modal_analysis.misfit import Record
 from sysid.modal_analysis.modal_estimate import Coupling, ModalEstimate
@@ -117,7 +117,7 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     if m - fit.static < 2 or shared > max(fit.static - 1, 0):  # turns of modes at one pole are none that show
         return modal
     model = CoupledLines(test, m, _by_weights(test, fit.weights), static=fit.static)
-    first = uncoupled(model.of_modes(fit.modes, fit.rigid, None))
+    first = model.of_modes(fit.modes, fit.rigid, None)
     here = model.normal_equations(first, model.levels)
     numbers = 2 * (test.response.size + test.base.size)
     freedom, count = numbers - model.unknowns, len(model.coupled)

@@ -172,7 +172,7 @@ class RecordModel(SpectralModel):
         modes, index = p.modes, self.index
         theta = np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios)])
         rigid = np.array([p.rigid[i, j] for i, j in index.pairs]) if self.force else np.zeros(0)
-        coupling = np.zeros(0) if p.coupling is None else p.coupling[*self.coupled.T]
+        coupling = np.zeros(len(self.coupled)) if p.coupling is None else p.coupling[*self.coupled.T]
         return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling])
 
     def unpack(self, x: Array) -> Parameters:
@@ -319,6 +319,19 @@ class Chunk(Lines):
             yield row, last + np.arange(2 * m), np.repeat(shapes, 2)
             last = last + 2 * m
         yield from self.of_sensor(channel, first[3], last)
+        beside = last + len(self.trace_spectra) + 2 * d * model.gains
+        for side, mode in enumerate(model.coupled.T[: 1 + model.force]):
+            pairs = np.arange(mode.size)
+            yield model.coupling.start + pairs, beside + side * mode.size + pairs, shapes[mode]
+
+    def spectra(self, base: ComplexArray) -> ComplexArray:
+        """Spectra of which all columns are made, those of couplings that are still zero at last."""
+        plain, pairs = super().spectra(base), self.records.coupled
+        if not len(pairs):
+            return plain
+        moved, moving = np.vstack([pairs, pairs[:, ::-1]])[: len(pairs) * (1 + self.records.force)].T
+        by = -1j * np.divide(self.g, self.run.w, out=np.zeros_like(self.g), where=self.run.w > 0)
+        return np.concatenate([plain, by[moved] * plain[moving]])
 
     def of_motion(self, channel: int, base: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """Entries of what multiplies the motions of the modes, and that of the base, whose spectra begin at `base`."""

@@ -242,3 +242,14 @@ def test_chi_squared_of_right_modes_and_levels_is_its_degrees_of_freedom() -> No
     p = Parameters(modes, np.zeros((d, d)), np.zeros((1, 2)), np.zeros((1, n, 3)))
     fit = RecordFit(test, p, levels[None], model.chi2(p, levels[None]), True)
     assert fit.reduced == pytest.approx(1.0, abs=4 * np.sqrt(2 / fit.freedom))
+
+
+@pytest.mark.parametrize("force", [True, False])
+@pytest.mark.parametrize("gains", [True, False])
+def test_equations_of_couplings_that_are_zero_need_no_coupled_modes(force: bool, gains: bool) -> None:
+    model, p, levels = _model(force, 2, coupled=True)
+    model = RecordModel(model.test, model.m, gains=gains, coupled=True)
+    plain = model.normal_equations(replace(p, coupling=None), levels)
+    general = model.normal_equations(replace(p, coupling=np.zeros((2, 2))), levels)
+    np.testing.assert_allclose(plain.normal, general.normal, atol=1e-12 * np.abs(general.normal).max())
+    np.testing.assert_allclose(plain.gradient, general.gradient, atol=1e-12 * np.abs(general.gradient).max())
