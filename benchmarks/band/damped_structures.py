@@ -137,9 +137,9 @@ def _matrices(rng: np.random.Generator, G: np.ndarray) -> tuple[np.ndarray, np.n
     return mass, K
 
 
-def test_of(structure: Damped, number: int) -> sysid.Measurement:
-    """One test with noise: spectra, a run a base axis, or a whole record of random motion."""
-    rng = np.random.default_rng((number, 28))
+def draw_of(structure: Damped, number: int, draw: int = 0) -> sysid.Measurement:
+    """One draw of its test, with noise: spectra, a run a base axis, or a whole record of random motion."""
+    rng = np.random.default_rng((number, draw, 28))
     return (of_record if structure.records else of_spectra)(structure, rng)
 
 

@@ -63,7 +63,9 @@ def with_couplings(
     p, m = fit.parameters, fit.model.m
     if p.coupling is not None or m - fit.static < 2:
         return fit
-    model, beyond = RecordModel(fit.test, m, static=fit.static, coupled=True), max(fit.reduced, 1.0)
+    # Beside what a wrong gain or modes above the lines make, which couplings would mimic.
+    model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True)
+    beyond = max(fit.reduced, 1.0)
     promised, count = score_of_couplings(model, model.normal_equations(p, fit.levels))
     if promised < beyond * beyond_chance(count):
         return fit

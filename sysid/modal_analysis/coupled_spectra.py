@@ -32,12 +32,12 @@ class CoupledLines(RecordModel):
     m : int
     weights : list of (run, (c,), (n_freq,))
         Weights of channels and lines in a run, as many of each run as needed; zero for channels that another one has.
-    static : int
+    static, gains :
         As in `RecordModel`.
     """
 
     def __init__(
-        self, test: Measurement, m: int, weights: list[tuple[int, Array, Array]], *, static: int, coupled: bool = True
+        self, test: Measurement, m: int, weights: list[tuple[int, Array, Array]], *, static: int, gains: bool = False
     ) -> None:
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         w, ones = 2 * np.pi * test.freq, np.ones(test.freq.size)
@@ -49,7 +49,7 @@ class CoupledLines(RecordModel):
         with np.errstate(divide="ignore"):
             of_outputs = np.array([channels for _, channels, _ in weights]) ** -2.0
         self.levels = np.hstack([of_outputs, np.zeros((len(runs), self.d))])
-        self._place(static, 0, gains=False, coupled=coupled)
+        self._place(static, 0, gains=gains, coupled=True)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
         """None."""
@@ -116,12 +116,13 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     m, shared = fit.modes.omega.size, fit.modes.omega.size - separate_poles(fit.modes)[0].size
     if m - fit.static < 2 or shared > max(fit.static - 1, 0):  # turns of modes at one pole are none that show
         return modal
-    model = CoupledLines(test, m, _by_weights(test, fit.weights), static=fit.static)
+    weights = _by_weights(test, fit.weights)
+    model, asked = (CoupledLines(test, m, weights, static=fit.static, gains=gains) for gains in (False, True))
     first = model.of_modes(fit.modes, fit.rigid, None)
-    here = model.normal_equations(first, model.levels)
+    here = asked.normal_equations(first, model.levels)
     numbers = 2 * (test.response.size + test.base.size)
     freedom, count = numbers - model.unknowns, len(model.coupled)
-    promised, seen = score_of_couplings(model, here)
+    promised, seen = score_of_couplings(asked, here)
     if freedom <= 0 or promised < 2 * here.chi2 / freedom * beyond_chance(seen):
         return modal
 
