@@ -1,6 +1,6 @@
 """Structures with a dashpot between two floors: modes counted, C within its intervals; classical ones as they were.
 
-``python -m benchmarks.band.dashpots 5007 SECONDS`` prints the figures of five draws of number 7 and of its classical twin.
+``python -m benchmarks.band.dashpots 5007 SECONDS`` prints figures of five draws of number 7, and of its classical twin.
 """
 
 from __future__ import annotations

@@ -226,14 +226,14 @@ def uncertainty(
 def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: GainErrors) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
-    modes, index, inflation, normals, unseen, shifts, found = moves_by_records(problem, structure, gains=True)
+    modes, index, inflation, normals, unseen, shifts, couplings = moves_by_records(problem, structure, gains=True)
     own = np.isin(modes.omega, separated_modes(structure).omega)
     possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
-    normals, coupling, coupled = _coupled(found, own, inflation, normals, unseen)
+    normals, coupling, coupled = _coupled(couplings, own, inflation, normals, unseen)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     mine = modes.at(own)
     changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
@@ -315,10 +315,10 @@ def moves_by_records(
 
 def _coupling_of(structure: Structure) -> Array:
     """Off-diagonal entries of ``Phi' C Phi`` of all modes, those of residual ones among them zero, (m, m)."""
-    own, beyond = structure.natural_frequencies, structure.residual.natural_frequencies
-    order = np.argsort(np.concatenate([own, beyond]), kind="stable")
-    coupling = np.pad(structure.modal_damping_matrix - np.diag(np.diag(structure.modal_damping_matrix)), (0, beyond.size))
-    return coupling[np.ix_(order, order)]
+    beyond = structure.residual.natural_frequencies
+    order = np.argsort(np.concatenate([structure.natural_frequencies, beyond]), kind="stable")
+    own = structure.modal_damping_matrix
+    return np.pad(own - np.diag(np.diag(own)), (0, beyond.size))[np.ix_(order, order)]
 
 
 def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:

@@ -74,9 +74,9 @@ class Coupling(NamedTuple):
     def about(self, step: Array) -> Array:
         """The likeliest couplings, (m, m), of modal parameters that are off by a step, (p,)."""
         moved = self.values.copy()
-        for (k, l), change in zip(self.pairs, self.follows @ step, strict=True):
-            moved[k, l] += change
-            moved[l, k] += change
+        first, second = self.pairs.T
+        moved[first, second] += (change := self.follows @ step)
+        moved[second, first] += change
         return moved
 
     def at(self, kept: NDArray[np.bool_], ours: NDArray[np.bool_], inverse: Array, across: Array) -> Coupling:

@@ -125,9 +125,9 @@ class RecordModel(SpectralModel):
         """Set where the unknowns stand; `traces` is how many a channel and run has."""
         test, m = self.test, self.m
         self.traces, self.n_ends = traces, m * 2 * len(self.moving)
-        n_traces = test.n_runs * self.channels * traces
+        before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
-        self.coupling = slice(self.kept + self.n_ends + n_traces, self.kept + self.n_ends + n_traces + len(self.coupled))
+        self.coupling = slice(before, before + len(self.coupled))
         self.n_fit = self.coupling.stop
         self.gains = gains
         self.size = self.n_fit + gains * 3 * self.n * self.d
@@ -304,7 +304,7 @@ class Chunk(Lines):
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """Entries of the columns of a channel's Jacobian by the spectra: unknowns, spectra and values, (k,) each."""
         model = self.records
-        n, m, d, index = model.n, model.m, model.d, model.index
+        m, d, index = model.m, model.d, model.index
         k = np.arange(m)
         shapes = self.shapes[channel]
         first = np.cumsum([0, m, m * d, 2 * m, d])  # of q, g u, slopes, u; then transients, traces
