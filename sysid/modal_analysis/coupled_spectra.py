@@ -18,6 +18,7 @@ from sysid.modal_analysis.modal_estimate import Coupling, ModalEstimate
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, separate_poles
 from sysid.modal_analysis.modal_model import Parameters, Run, SpectralModel
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.response import weights_of_test
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT, beyond_chance
@@ -141,15 +142,20 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
 
 
 def _estimate(modal: ModalEstimate, model: CoupledLines, p: Parameters, chi2: float, variance: float) -> ModalEstimate:
-    """The estimate at the end of a fit, with the variance of a real number that has the weight one."""
+    """The estimate at the end of a fit, with the variance of a real number that has the weight one.
+
+    Its information is in units of the records' stated noise, or in theirs where none is stated.
+    """
     order = np.argsort(p.modes.omega, kind="stable")
     modes, coupling = p.modes.at(order), p.coupling
     assert coupling is not None and modal.fit is not None
     p = replace(p, modes=modes, coupling=coupling[np.ix_(order, order)])
-    A, found = _information(model, p, variance)
+    size = weights_of_test(model.test, weighted=True)[0][1]
+    A, found = _information(model, p, size**-2)
     n = model.n
     fit: ModalFit = replace(modal.fit, modes=modes, rigid=p.rigid, residual=float(np.sqrt(chi2)), status="settled")
     gain = replace(modal.gain, moves=np.zeros((model.index.size, n)))
     return replace(
-        modal, **modes._asdict(), rigid=p.rigid, fit=fit, information=A, gain=gain, coupling=found, reduced=1.0
+        modal, **modes._asdict(), rigid=p.rigid, fit=fit, information=A, gain=gain, coupling=found,
+        reduced=variance * size**2,
     )  # fmt: skip

@@ -216,7 +216,7 @@ class ModalEstimate:
         size = np.sqrt(np.maximum(np.diag(self.information), np.finfo(float).tiny))
         inverse = np.linalg.pinv(self.information / np.outer(size, size), rcond=ROUND_OFF, hermitian=True)
         turned = self.coupling.follows / size
-        return np.sqrt(np.diag(self.coupling.covariance + turned @ inverse @ turned.T / 2))
+        return np.sqrt(self.reduced * np.diag(self.coupling.covariance + turned @ inverse @ turned.T / 2))
 
     def at(self, kept: NDArray[np.bool_]) -> ModalEstimate:
         """The estimate of some of the modes, (m,), whatever the others are: those of whole records."""

@@ -182,3 +182,11 @@ def test_the_answer_has_the_damping_matrix_with_honest_deviations(records, tmp_p
     again = sysid.load(sysid_file)
     np.testing.assert_array_equal(again.structure.damping, result.structure.damping)
     np.testing.assert_allclose(again.uncertainty.damping, result.uncertainty.damping, rtol=1e-6)
+
+
+def test_exact_spectra_give_the_damping_matrix_to_round_off():
+    truth = building()
+    test = sysid.simulate(truth, np.geomspace(1.2, 14.0, 200), force=True)
+    result = sysid.identify(sysid.Problem(test), rng=0)
+    assert result.determined
+    np.testing.assert_allclose(result.structure.damping, truth.damping, atol=1e-8 * truth.damping.max())
