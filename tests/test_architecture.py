@@ -34,7 +34,7 @@ CEILINGS = {
     # and lines that begin above the lowest mode, where nothing is judged by a constant (65),
     # and weights that channels have in each run, with modes judged by these, and sizes of participations (204),
     # and modes that dampers couple, in spectra and whole records, with C and its deviations (580).
-    "lines": 41_660,
+    "lines": 41_670,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

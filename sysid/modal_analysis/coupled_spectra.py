@@ -65,13 +65,11 @@ class CoupledLines(RecordModel):
 def _by_weights(test: Measurement, weights: Weights) -> list[tuple[int, Array, Array]]:
     """Weights of a fit of plain spectra, for `CoupledLines`."""
     assert weights.force is not None
-    none, found = np.zeros_like, []
+    found = []
     for run in range(test.n_runs):
-        both = [(weights.sensors[run], none(weights.force[run]), weights.lines[run])]
-        both.append((none(weights.sensors[run]), weights.force[run], weights.force_lines[run]))
-        if weights.force_lines is weights.lines:
-            both = [(weights.sensors[run], weights.force[run], weights.lines[run])]
-        found += [(run, np.concatenate(channels), lines) for *channels, lines in both]
+        sensors, force = weights.sensors[run], weights.force[run]
+        found.append((run, np.append(sensors, np.zeros_like(force)), weights.lines[run]))
+        found.append((run, np.append(np.zeros_like(sensors), force), weights.force_lines[run]))
     return found
 
 

@@ -339,9 +339,8 @@ def _moved(before: Parameters, after: Parameters) -> float:
     """
     modes, other = before.modes, after.modes
     loss = np.sqrt(2 * modes.ratios * modes.omega)
-    coupled = 0.0
-    if before.coupling is not None and after.coupling is not None:
-        coupled = np.abs((after.coupling - before.coupling) / np.outer(loss, loss)).max()
+    apart = 0.0 if before.coupling is None else np.asarray(after.coupling) - before.coupling
+    coupled = np.abs(apart / np.outer(loss, loss)).max()
     turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
     pole = np.abs(np.log(other.omega / modes.omega)) / modes.ratios
     return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios), coupled))
