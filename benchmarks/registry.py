@@ -201,6 +201,7 @@ BENCHMARKS = (
     Benchmark(
         "band.above_first_mode", "lines that begin above the first mode: nothing right accused", "10 min", "20 s"
     ),
+    Benchmark("band.dashpots", "damping that is not classical: modes, C within its intervals, told", "10 min", "25 s"),
     Benchmark("band.wrong_sensors", "one wrong sensor among modes beyond the lines: named", "40 min", "20 s"),
     Benchmark(
         "band.residuals_in_searches",

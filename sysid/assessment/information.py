@@ -231,10 +231,13 @@ class DirectSpectra:
         return std_of(change @ self.steps, self.normals, float(np.abs(s.structure.rigid_body_mass).max()))
 
 
-def changes_of_matrices(structure: Structure, modes: Modes, moves: Perturbations) -> Iterator[tuple[Array, Array]]:
+def changes_of_matrices(
+    structure: Structure, modes: Modes, moves: Perturbations, coupling: Array, coupled: Array
+) -> Iterator[tuple[Array, Array]]:
     """Changes of M_SS, K_SS and C at the degrees of freedom, (n, n, moves), and the size of their entries, (n, n).
 
-    Each is ``T^-T D T^-1``, T the modes at the degrees of freedom, D diagonal. Degrees of freedom at a sensor move with
+    Each is ``T^-T D T^-1``, T the modes at the degrees of freedom, D diagonal but for the `coupling` (n, n) of modes by
+    dampers, which changes by `coupled` (n, n, moves). Degrees of freedom at a sensor move with
     its row of the mode shapes, modal coordinates stand still; NaN where one is neither.
     """
     T, (_, _, omega, ratios) = structure.normal_modes, modes
@@ -247,12 +250,14 @@ def changes_of_matrices(structure: Structure, modes: Modes, moves: Perturbations
     P = np.linalg.inv(T)
     moved = P.T @ (P @ dT.reshape(len(T), -1)).reshape(dT.shape)  # P dT P
     squared, loss = omega**2, 2 * ratios * omega
-    for diagonal, change in (
-        (np.ones_like(omega), np.zeros_like(moves.log_omega)),
-        (squared, 2 * squared[:, None] * moves.log_omega),
-        (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
+    for diagonal, change, others in (
+        (np.ones_like(omega), np.zeros_like(moves.log_omega), False),
+        (squared, 2 * squared[:, None] * moves.log_omega, False),
+        (loss, loss[:, None] * (moves.log_omega + moves.log_ratios), bool(np.any(coupling))),
     ):
         inner = change[:, None] / 2 * P[:, :, None] - diagonal[:, None, None] * moved
+        if others:
+            inner += np.einsum("klc,lj->kjc", coupled / 2, P) - np.einsum("kl,ljc->kjc", coupling, moved)
         half = (P.T @ inner.reshape(len(P), -1)).reshape(inner.shape)
         size = np.sqrt(diagonal @ P**2)
         yield half + half.swapaxes(0, 1), np.outer(size, size)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.assessment.checks.gains import GainErrors, gain_errors
 from sysid.assessment.information import (
@@ -39,8 +39,16 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
+from sysid.modal_analysis.coupled_spectra import coupling_information
 from sysid.modal_analysis.misfit import inflation_of, noise_records
-from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, information_about, shifts_about
+from sysid.modal_analysis.modal_estimate import (
+    Coupling,
+    ModalEstimate,
+    coupling_about,
+    independent_rows,
+    information_about,
+    shifts_about,
+)
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
@@ -219,21 +227,23 @@ def uncertainty(
 def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: GainErrors) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
-    modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
+    modes, index, inflation, normals, unseen, shifts, couplings = moves_by_records(problem, structure, gains=True)
     own = np.isin(modes.omega, separated_modes(structure).omega)
     possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
+    normals, coupling, coupled = _coupled(couplings, own, inflation, normals, unseen)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     mine = modes.at(own)
-    matrices = [moves.std(change, size) for change, size in changes_of_matrices(structure, mine, moves.of(own))]
+    changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
+    matrices = [moves.std(change, size) for change, size in changes]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = [open_, open_, open_]  # zeros that a decoupled structure keeps included
     by_gains = Perturbations(0, *index.split(shifts))
-    mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own)))
+    mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own), coupling, coupled))
     by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))
     spectra = ModalSpectra(modes, moves, structure.rigid_body_mass)
     found = _quantities(problem, structure, mine, moves.of(own), inflation, matrices, by_gain, spectra)
@@ -245,12 +255,31 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
 
 
+def _coupled(
+    found: Coupling | None, own: NDArray[np.bool_], inflation: float, normals: Array, unseen: Array
+) -> tuple[Array, Array, Array]:
+    """Moves with those of couplings by dampers beside, the couplings of one's `own` modes (n, n), and their changes."""
+    n = np.count_nonzero(own)
+    if found is None:
+        return normals, np.zeros((n, n)), np.zeros((n, n, normals.shape[1] + unseen.shape[1]))
+    lam, V = np.linalg.eigh(found.covariance)
+    alone = inflation * V * np.sqrt(np.maximum(lam, 0.0))
+    change = np.hstack([found.follows @ normals, alone, found.follows @ unseen])
+    inside, place = np.all(own[found.pairs], axis=1), np.cumsum(own) - 1
+    coupled: Array = np.zeros((n, n, change.shape[1]))
+    first, second = place[found.pairs[inside]].T
+    coupled[first, second] = coupled[second, first] = change[inside]
+    wider = np.hstack([normals, np.zeros((len(normals), lam.size))])
+    return wider, found.values[np.ix_(own, own)], coupled
+
+
 def moves_by_records(
     problem: Prepared, structure: Structure, *, gains: bool = False
-) -> tuple[Modes, Index, float, Array, Array, Array]:
+) -> tuple[Modes, Index, float, Array, Array, Array, Coupling | None]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
-    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
+    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it. At last
+    the couplings of these modes by dampers, and how they move.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
     if modal.by_modes and modal.omega.size != modes.omega.size:  # residual modes of other numbers: by the lines
@@ -263,11 +292,15 @@ def moves_by_records(
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B, spectra = noise_records(test, structure, unknowns), None, None
-    if modal.by_modes:
+    found = coupling_about(modal, modes) if modal.of_records else None
+    if modal.of_records:
         A, B = information_about(modal, modes)
     else:
         spectra = spectra_of(test, modes)
         A = information(modes, index, [record.grams(spectra) for record in records])
+        if not structure.modal_damping:
+            coupling, rigid = _coupling_of(structure), structure.rigid_body_mass
+            A, found = coupling_information(test, records, modes, rigid, coupling, structure.residual.static)
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
@@ -280,7 +313,15 @@ def moves_by_records(
             pulls = A @ shifts_about(modal, modes)
         plain = normals if B is None else spread(A, None, path)[0]
         shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
-    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts
+    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts, found
+
+
+def _coupling_of(structure: Structure) -> Array:
+    """Off-diagonal entries of ``Phi' C Phi`` of all modes, those of residual ones among them zero, (m, m)."""
+    beyond = structure.residual.natural_frequencies
+    order = np.argsort(np.concatenate([structure.natural_frequencies, beyond]), kind="stable")
+    own = structure.modal_damping_matrix
+    return np.pad(own - np.diag(np.diag(own)), (0, beyond.size))[np.ix_(order, order)]
 
 
 def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:

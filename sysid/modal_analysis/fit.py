@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
@@ -116,7 +117,9 @@ def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
 
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
-    """The fit with further modes that are worth it, then without spurious ones; `some` as in `refitted`."""
+    """The fit with couplings, then further modes that are worth it, without spurious ones; `some` as in `refitted`."""
+    fit = with_couplings(fit, lambda rough: _pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
+    monitor.keep(fit)
     monitor.doing = "further modes"
     fit = with_further_modes(fit, some=some, monitor=monitor)
     monitor.doing = "spurious modes"
@@ -262,6 +265,6 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
-        record_fit=fit, static=fit.static,
+        record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

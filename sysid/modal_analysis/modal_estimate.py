@@ -14,10 +14,10 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
 from sysid.modal_analysis.record_fit import RecordFit
-from sysid.modal_analysis.response import columns, gains, weights_of
+from sysid.modal_analysis.response import columns, coupled_flexibility, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import round_off
+from sysid.structure.thresholds import ROUND_OFF, round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +57,37 @@ class VaryingLevel(NamedTuple):
     run: int
     least: float
     largest: float
+
+
+class Coupling(NamedTuple):
+    """Off-diagonal entries of ``Phi' C Phi`` of modes that dampers couple, rad/s, and their errors beside the modes'.
+
+    `values` (m, m); `pairs` (k, 2) of modes, first below second. Where the modal parameters are off by a step, the
+    couplings are likeliest off by `follows` (k, p) times it; what they are off beside has `covariance` (k, k).
+    """
+
+    values: Array
+    pairs: NDArray[np.intp]
+    follows: Array
+    covariance: Array
+
+    def about(self, step: Array) -> Array:
+        """The likeliest couplings, (m, m), of modal parameters that are off by a step, (p,)."""
+        moved = self.values.copy()
+        first, second = self.pairs.T
+        moved[first, second] += (change := self.follows @ step)
+        moved[second, first] += change
+        return moved
+
+    def at(self, kept: NDArray[np.bool_], ours: NDArray[np.bool_], inverse: Array, across: Array) -> Coupling:
+        """Those of some modes, (m,), with parameters `ours` (p,); the others are off by ``-inverse across step``."""
+        inside, place = np.all(kept[self.pairs], axis=1), np.cumsum(kept) - 1
+        lost = self.follows[inside][:, ~ours]
+        return Coupling(
+            self.values[np.ix_(kept, kept)], place[self.pairs[inside]],
+            self.follows[inside][:, ours] - lost @ inverse @ across,
+            self.covariance[np.ix_(inside, inside)] + lost @ inverse @ lost.T / 2,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +140,8 @@ class ModalEstimate:
         Indices of runs stated to be at rest at both ends that the records show were not.
     record_fit : RecordFit or None
         Of whole records, of which all else can be made again.
+    coupling : Coupling or None
+        Of modes that dampers couple, where a force was measured; None where the damping is classical.
     """
 
     given: Measurement
@@ -133,6 +166,7 @@ class ModalEstimate:
     static: int = 0
     lacking: str = ""
     record_fit: RecordFit | None = None
+    coupling: Coupling | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
@@ -148,6 +182,11 @@ class ModalEstimate:
     def by_modes(self) -> bool:
         """True where the statistics of its modes stand for the lines."""
         return self.information.size > 0
+
+    @property
+    def of_records(self) -> bool:
+        """True where these are the statistics of whole records."""
+        return self.by_modes and self.given.whole is not None
 
     @property
     def stopped(self) -> bool:
@@ -170,6 +209,15 @@ class ModalEstimate:
         """The likeliest modes."""
         return Modes(self.phi, self.gamma, self.omega, self.ratios)
 
+    @property
+    def coupling_std(self) -> Array:
+        """Standard deviations of the couplings, (k,), rad/s, of all errors together."""
+        assert self.coupling is not None
+        size = np.sqrt(np.maximum(np.diag(self.information), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(self.information / np.outer(size, size), rcond=ROUND_OFF, hermitian=True)
+        turned = self.coupling.follows / size
+        return np.sqrt(self.reduced * np.diag(self.coupling.covariance + turned @ inverse @ turned.T / 2))
+
     def at(self, kept: NDArray[np.bool_]) -> ModalEstimate:
         """The estimate of some of the modes, (m,), whatever the others are: those of whole records."""
         n, d = self.records.rigid_body.shape
@@ -179,8 +227,9 @@ class ModalEstimate:
         inner = np.linalg.pinv(A[np.ix_(~ours, ~ours)] / np.outer(size, size), hermitian=True) / np.outer(size, size)
         turn = np.eye(ours.size)[ours]
         turn[:, ~ours] = -A[np.ix_(ours, ~ours)] @ inner
+        coupling = self.coupling and self.coupling.at(kept, ours, inner, A[np.ix_(~ours, ours)])
         return replace(
-            self, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,
+            self, coupling=coupling, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,
             scatter=None if B is None else turn @ B @ turn.T, gain=replace(self.gain, moves=self.gain.moves[ours]),
         )  # fmt: skip
 
@@ -188,7 +237,12 @@ class ModalEstimate:
 def residual_of(estimate: ModalEstimate, modes: Modes) -> float:
     """Relative, weighted residual of the accelerations that modes leave."""
     test = estimate.records
-    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
+    loads = np.einsum("md,rdf->rmf", modes.gamma, test.base)
+    if estimate.coupling is None:
+        q = gains(test.freq, modes.omega, modes.ratios) * loads
+    else:
+        flexibility = coupled_flexibility(test.freq, modes.omega, modes.ratios, estimate.coupling.values)
+        q = (2 * np.pi * test.freq) ** 2 * np.einsum("jkf,rkf->rjf", flexibility, loads)
     weight, size = weights_of(test.relative, test.response_std)
     left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modes.phi, q))
     return float(np.linalg.norm(left)) / size
@@ -296,3 +350,16 @@ def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
         return None
     apart = np.abs(np.log(omega[None] / estimate.omega[:, None]))
     return np.asarray(linear_sum_assignment(apart)[1])
+
+
+def coupling_about(estimate: ModalEstimate, modes: Modes) -> Coupling | None:
+    """The couplings, with steps of modal parameters and signs as those of `modes`, nearly the estimate's."""
+    found = estimate.coupling
+    if found is None:
+        return None
+    sign = np.sign(np.sum(modes.gamma * estimate.gamma, axis=1))
+    turn = np.prod(sign[found.pairs], axis=1)
+    return found._replace(
+        values=found.values * np.outer(sign, sign), follows=turn[:, None] * found.follows * _scale_of(estimate, modes),
+        covariance=found.covariance * np.outer(turn, turn),
+    )  # fmt: skip

@@ -6,21 +6,23 @@ A run of a test is, at its lines,
           f = M_{rb} u + \sum_k \gamma_k' g_k (\ldots) + p,
 
 with two real numbers alpha, beta a mode and run for its motion at the ends, and p the traces of sampling and
-detrending: real multiples of 1, i w and 1 / (i w), a channel and run. Plain spectra have neither.
+detrending: real multiples of 1, i w and 1 / (i w), a channel and run. Plain spectra have neither. Where dampers couple
+the modes, :math:`w^2 (W^2 - w^2 + i w \Phi' C \Phi)^{-1}` stands in the place of the gains g.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
-from sysid.modal_analysis.response import gains, modes_above, motion_and_slopes, real_times
+from sysid.modal_analysis.response import coupled_flexibility, gains, modes_above, motion_and_slopes, real_times
 from sysid.structure.structure import Array, ComplexArray
 
 FAR = 30.0  # logarithms of frequencies and damping ratios: no step of use leads beyond
@@ -74,12 +76,26 @@ class Parameters:
     ends : (m, 2 r)
         alpha, beta of each mode and moving run.
     traces : (runs, c, 3)
+    coupling : (m, m) or None
+        rad/s, off the diagonal of ``Phi' C Phi``, of modes that dampers couple; None where damping is classical.
     """
 
     modes: Modes
     rigid: Array
     ends: Array
     traces: Array
+    coupling: Array | None = None
+
+    def at(self, kept: NDArray[np.bool_]) -> Parameters:
+        """Those of some of the modes, (m,)."""
+        coupling = None if self.coupling is None else self.coupling[np.ix_(kept, kept)]
+        return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling)
+
+    def with_modes(self, modes: Modes, ends: Array) -> Parameters:
+        """The same with further modes behind its own, which no damper couples to these; `modes` and `ends` are all."""
+        more = modes.omega.size - self.modes.omega.size
+        coupling = None if self.coupling is None else np.pad(self.coupling, (0, more))
+        return replace(self, modes=modes, ends=ends, coupling=coupling)
 
 
 class SpectralModel:
@@ -154,16 +170,33 @@ class Lines:
         self.transients = np.zeros((0, run.w.size), complex) if at is None else model.transients(freq)
         self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
         self.trace_spectra = model.trace_spectra(freq)
-        self.motion = self.g * (real_times(modes.gamma, run.base) + self.pushed_by_ends)
+        self.motion = self.answer(real_times(modes.gamma, run.base) + self.pushed_by_ends)
         predicted = real_times(self.shapes, self.motion) + real_times(self.direct, run.base)
         if len(self.trace_spectra):
             predicted += real_times(p.traces[run.number], self.trace_spectra)
         self.error = run.outputs - predicted
 
     @cached_property
+    def flexibility(self) -> ComplexArray:
+        """See `coupled_flexibility`, (m, m, L)."""
+        modes, coupling = self.p.modes, self.p.coupling
+        assert coupling is not None
+        return coupled_flexibility(self.run.w / (2 * np.pi), modes.omega, modes.ratios, coupling)
+
+    def answer(self, loads: ComplexArray) -> ComplexArray:
+        """Motions of the modes under loads (m, L)."""
+        if self.p.coupling is None:
+            return self.g * loads
+        return self.run.w**2 * np.einsum("jkl,kl->jl", self.flexibility, loads)
+
+    @cached_property
     def H(self) -> ComplexArray:  # noqa: N802
         """From base to outputs, (c, d, L)."""
-        pushed = (self.g[:, None] * self.p.modes.gamma[:, :, None]).reshape(len(self.g), -1)
+        gamma = self.p.modes.gamma
+        if self.p.coupling is None:
+            pushed = (self.g[:, None] * gamma[:, :, None]).reshape(len(self.g), -1)
+        else:
+            pushed = (self.run.w**2 * np.einsum("jkl,kd->jdl", self.flexibility, gamma)).reshape(len(self.g), -1)
         return real_times(self.shapes, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:

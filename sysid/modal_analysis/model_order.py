@@ -125,7 +125,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
         np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, np.diag(gamma)]), np.append(p.modes.omega, held),
         np.append(p.modes.ratios, np.full(d, ratio)),
     )  # fmt: skip
-    first = replace(p, modes=modes, ends=np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
+    first = p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
     monitor = monitor or FitMonitor()
     monitor.doing = "modes above the lines"
     more = refitted(fit, first, monitor=monitor, static=d)
@@ -319,7 +319,7 @@ def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
         np.column_stack([modes.phi, phi]), np.vstack([modes.gamma, gamma]), np.append(modes.omega, omega),
         np.append(modes.ratios, ratio),
     )  # fmt: skip
-    return Parameters(more, p.rigid, np.vstack([p.ends, push[d:]]), p.traces)
+    return p.with_modes(more, np.vstack([p.ends, push[d:]]))
 
 
 _MORE = 4.0  # times what a mode must be worth where noise alone is left
@@ -361,8 +361,7 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
     model, p, c = fit.model, fit.parameters, fit.model.channels
     powers: list[list[Array]] = [[] for _ in model.runs]  # of what is left, of all modes, and of each, (2 + m, L)
     for chunk in model.chunks(p):
-        pushed = p.modes.gamma @ chunk.run.base + chunk.pushed_by_ends
-        each = (chunk.shapes[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
+        each = (chunk.shapes[:, :, None] * chunk.motion).swapaxes(0, 1)  # (m, c, L)
         moved_by = [None, each.sum(axis=0), *each]
         powers[chunk.run.piece].append(np.stack([chunk.weighed(fit.levels, one).power for one in moved_by]))
     whole = [np.concatenate(one, axis=1) for one in powers]

@@ -83,12 +83,17 @@ class RecordFit:
     @cached_property
     def model(self) -> RecordModel:
         """The model that was fitted."""
-        return RecordModel(self.test, self.parameters.modes.omega.size, static=self.static)
+        return self.model_of(self.parameters)
+
+    def model_of(self, p: Parameters, test: Measurement | None = None, *, gains: bool = False) -> RecordModel:
+        """The model of other parameters, or of another test: of these where none is given."""
+        coupled, m = p.coupling is not None, p.modes.omega.size
+        return RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled)
 
     @cached_property
     def equations(self) -> NormalEquations:
         """Normal equations at the end of the fit, with the columns of gains, which come last."""
-        model = RecordModel(self.test, self.parameters.modes.omega.size, gains=True, static=self.static)
+        model = self.model_of(self.parameters, gains=True)
         return model.normal_equations(self.parameters, self.levels)
 
     @property
@@ -159,7 +164,7 @@ class RecordFit:
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
-            "varying": self.model.whole.varying, "kept": self.kept,
+            "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
         }  # fmt: skip
 
     @classmethod
@@ -173,8 +178,8 @@ class RecordFit:
         """
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
-        p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"])
-        kept = tree.get("kept")  # results of before hold none
+        coupling, kept = tree.get("coupling"), tree.get("kept")  # results of before hold none
+        p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"], coupling)
         fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
@@ -183,6 +188,7 @@ class RecordFit:
             (test.n_runs, c, TRACES), (len(model.runs), c + model.d),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
+        sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
         sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))
         return fit
@@ -219,9 +225,9 @@ def refitted(
     Where lines are many, `some` is the test at a few of them, which give the normal matrix of each step. Gradients and
     what is left are those of all lines, so that the end is theirs.
     """
-    m, static = p.modes.omega.size, fit.static if static is None else static
-    coarse = None if some is None else RecordModel(some, m, static=static).weighed_as_all()
-    return _fit(RecordModel(fit.test, m, static=static), p, fit.levels, monitor or FitMonitor(), limits, coarse)
+    fit = fit if static is None else replace(fit, static=static)
+    coarse = None if some is None else fit.model_of(p, some).weighed_as_all()
+    return _fit(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
 
 
 def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
@@ -231,7 +237,8 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
     """
     m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
     first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, TRACES)))
-    return _fit(HeldShapes(test, m, poles=held, static=fit.static), first, None, FitMonitor(), _POLES)
+    model = HeldShapes(test, m, poles=held, static=fit.static, coupled=first.coupling is not None)
+    return _fit(model, first, None, FitMonitor(), _POLES)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
@@ -241,8 +248,7 @@ def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | Non
 
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
     """The same in one step, with levels and sum of squares of all lines; settled where the fit of some lines was."""
-    model = RecordModel(test, fit.parameters.modes.omega.size, static=fit.static)
-    coarse = RecordModel(fit.test, model.m, static=fit.static).weighed_as_all()
+    model, coarse = fit.model_of(fit.parameters, test), fit.model_of(fit.parameters).weighed_as_all()
     one = _fit(model, fit.parameters, fit.levels, FitMonitor(), Limits(1, 1), coarse)
     return replace(one, settled=fit.settled)
 
@@ -313,7 +319,7 @@ class _Equations:
 
     def __call__(self, p: Parameters, levels: Array, near: float = 0.2) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
-        if self.at is not None and _moved(self.at[0].modes, p.modes) + _largest(levels / self.at[1]) < near:
+        if self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
@@ -326,11 +332,18 @@ class _Equations:
         return None if self.at is not None and self.at[0] is p else self(p, levels, near=0.0)
 
 
-def _moved(modes: Modes, other: Modes) -> float:
-    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape."""
+def _moved(before: Parameters, after: Parameters) -> float:
+    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape.
+
+    And of couplings, over the losses of the modes.
+    """
+    modes, other = before.modes, after.modes
+    loss = np.sqrt(2 * modes.ratios * modes.omega)
+    apart = 0.0 if before.coupling is None else np.asarray(after.coupling) - before.coupling
+    coupled = np.abs(apart / np.outer(loss, loss)).max()
     turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
     pole = np.abs(np.log(other.omega / modes.omega)) / modes.ratios
-    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios)))
+    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios), coupled))
 
 
 def _largest(ratios: Array) -> float:
@@ -396,8 +409,7 @@ def _rough_levels(model: RecordModel, p: Parameters) -> Array:
 
 def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
     """Parameters of a fit without some modes, (m,)."""
-    p, keep = fit.parameters, ~gone
-    return replace(p, modes=p.modes.at(keep), ends=p.ends[keep])
+    return fit.parameters.at(~gone)
 
 
 def worth(fit: RecordFit, normal: Array | None = None) -> Array:
@@ -420,13 +432,15 @@ def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArra
         index.gamma.start + np.arange(m * model.d).reshape(m, -1), np.arange(m)[:, None] + index.log_omega.start,
         np.arange(m)[:, None] + index.log_ratios.start, model.kept + np.arange(model.n_ends).reshape(m, -1),
     ])  # fmt: skip
-    phi = np.divide(fit.parameters.modes.phi.ravel(), unit[index.phi], out=np.zeros(n * m), where=unit[index.phi] > 0)
+    x = np.divide(model.pack(fit.parameters), unit, out=np.zeros(model.size), where=unit > 0)
 
     def rise(modes: NDArray[np.bool_]) -> float:
+        couplings = np.flatnonzero(np.any(modes[model.coupled], axis=1))  # a mode that is gone moves no other
         of_shapes = shapes[:, modes].ravel()
-        gone = np.concatenate([of_shapes, others[modes].ravel()])
+        lost = np.concatenate([of_shapes, model.coupling.start + couplings])
+        gone = np.concatenate([lost, others[modes].ravel()])
         # The inverse of this block is the normal matrix of these less what all others explain of it.
-        left = np.linalg.inv(inverse[np.ix_(gone, gone)])[: of_shapes.size, : of_shapes.size]
-        return float(phi[of_shapes] @ left @ phi[of_shapes])
+        left = np.linalg.inv(inverse[np.ix_(gone, gone)])[: lost.size, : lost.size]
+        return float(x[lost] @ left @ x[lost])
 
     return rise

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
-from sysid.modal_analysis.response import real_times
+from sysid.modal_analysis.response import modes_above, real_times
 from sysid.structure.structure import Array, ComplexArray
 
 TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w)
@@ -89,15 +89,21 @@ class RecordModel(SpectralModel):
     With `gains` there are further columns, to be asked of at an end, (n_sensors, d) of each kind: a constant share of
     the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what `modes_above` the lines make.
 
-    The last `static` modes share a pole that is held, and do not move at the ends of runs.
+    The last `static` modes share a pole that is held, and do not move at the ends of runs. Where the others are
+    `coupled` by dampers, entries of ``Phi' C Phi`` off the diagonal are the last unknowns before those of gains: each
+    once, or, without a force, where modes have no scale of their own, on both sides of the diagonal.
 
     Attributes
     ----------
     held : (size,) of bool
         Unknowns that stay as they are.
+    coupled : (k, 2) of int
+        The modes that each coupling acts between.
     """
 
-    def __init__(self, test: Measurement, m: int, *, gains: bool = False, static: int = 0) -> None:
+    def __init__(
+        self, test: Measurement, m: int, *, gains: bool = False, static: int = 0, coupled: bool = False
+    ) -> None:
         assert test.whole is not None
         self.whole = test.whole
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
@@ -113,8 +119,16 @@ class RecordModel(SpectralModel):
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self.n_ends = m * 2 * len(self.moving)
-        self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
+        self._place(static, TRACES, gains=gains, coupled=coupled)
+
+    def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
+        """Set where the unknowns stand; `traces` is how many a channel and run has."""
+        test, m = self.test, self.m
+        self.traces, self.n_ends = traces, m * 2 * len(self.moving)
+        before = self.kept + self.n_ends + test.n_runs * self.channels * traces
+        self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
+        self.coupling = slice(before, before + len(self.coupled))
+        self.n_fit = self.coupling.stop
         self.gains = gains
         self.size = self.n_fit + gains * 3 * self.n * self.d
         self.static, self.held = static, np.zeros(self.size, bool)
@@ -158,7 +172,8 @@ class RecordModel(SpectralModel):
         modes, index = p.modes, self.index
         theta = np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios)])
         rigid = np.array([p.rigid[i, j] for i, j in index.pairs]) if self.force else np.zeros(0)
-        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel()])
+        coupling = np.zeros(len(self.coupled)) if p.coupling is None else p.coupling[*self.coupled.T]
+        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling])
 
     def unpack(self, x: Array) -> Parameters:
         """The inverse of `pack`."""
@@ -169,9 +184,14 @@ class RecordModel(SpectralModel):
         # No step of use leads beyond these.
         omega, ratios = np.exp(np.clip(log_omega, -FAR, FAR)), np.exp(np.clip(log_ratios, -FAR, FAR))
         modes = Modes(phi, gamma, omega, ratios)
-        ends, traces = np.split(x[self.kept :], [self.n_ends])
-        shape = (len(self.whole.samples), self.channels, TRACES)
-        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape))
+        ends, traces = np.split(x[self.kept : self.coupling.start], [self.n_ends])
+        shape = (self.test.n_runs, self.channels, self.traces)
+        coupling = None
+        if len(self.coupled):
+            coupling = np.zeros((self.m, self.m))
+            coupling[*self.coupled.T] = x[self.coupling]
+            coupling = coupling + coupling.T if self.force else coupling
+        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape), coupling)
 
     @property
     def unknowns(self) -> int:
@@ -186,11 +206,18 @@ class RecordModel(SpectralModel):
             row[index.phi][k :: self.m] = p.modes.phi[:, k]
             row[index.gamma][k * self.d : (k + 1) * self.d] = -p.modes.gamma[k]
             row[self.kept : self.kept + self.n_ends].reshape(self.m, -1)[k] = -p.ends[k]
+            if p.coupling is not None:
+                sides = (self.coupled == k) * p.coupling[*self.coupled.T][:, None]
+                row[self.coupling] = sides[:, 1] - sides[:, 0]
         return rows
 
     def chunks(self, p: Parameters) -> Iterator[Chunk]:
         """See `SpectralModel`."""
-        return (Chunk(self, p, run) for run in self.parts())
+        return (self.chunk(p, run) for run in self.parts())
+
+    def chunk(self, p: Parameters, run: Run) -> Chunk:
+        """Some lines at given parameters."""
+        return Chunk(self, p, run) if p.coupling is None else CoupledChunk(self, p, run)
 
     def normal_equations(self, p: Parameters, levels: Array) -> NormalEquations:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
@@ -231,9 +258,12 @@ class HeldShapes(RecordModel):
     What is left to be found are poles, transients and traces.
     """
 
-    def __init__(self, test: Measurement, m: int, *, poles: bool = False, static: int = 0) -> None:
-        super().__init__(test, m, static=static)
+    def __init__(
+        self, test: Measurement, m: int, *, poles: bool = False, static: int = 0, coupled: bool = False
+    ) -> None:
+        super().__init__(test, m, static=static, coupled=coupled)
         self.held[: self.index.log_omega.start], self.held[self.index.log_ratios.stop : self.kept] = True, True
+        self.held[self.coupling] = True
         self.held[self.index.log_omega.start : self.index.log_ratios.stop] |= poles
 
     def scales(self, p: Parameters) -> Array:
@@ -274,17 +304,11 @@ class Chunk(Lines):
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """Entries of the columns of a channel's Jacobian by the spectra: unknowns, spectra and values, (k,) each."""
         model = self.records
-        n, m, d, index = model.n, model.m, model.d, model.index
-        k, beside, traces = np.arange(m), np.arange(d), np.arange(TRACES)
+        m, d, index = model.m, model.d, model.index
+        k = np.arange(m)
         shapes = self.shapes[channel]
         first = np.cumsum([0, m, m * d, 2 * m, d])  # of q, g u, slopes, u; then transients, traces
-        if channel < n:
-            yield index.phi.start + channel * m + k, k, np.ones(m)
-        else:
-            yield index.gamma.start + k * d + channel - n, k, np.ones(m)
-            for at, (a, b) in enumerate(index.pairs):
-                if channel - n in (a, b):
-                    yield index.rigid[[at]], first[[3]] + (b if channel - n == a else a), np.ones(1)
+        yield from self.of_motion(channel, first[3])
         yield index.gamma.start + np.arange(m * d), first[1] + np.arange(m * d), np.repeat(shapes, d)
         yield index.log_omega.start + k, first[2] + k, shapes
         yield index.log_ratios.start + k, first[2] + m + k, shapes
@@ -294,13 +318,46 @@ class Chunk(Lines):
             row = model.kept + np.repeat(k, 2) * runs + self.at_ends.start + pair
             yield row, last + np.arange(2 * m), np.repeat(shapes, 2)
             last = last + 2 * m
-        first_trace = model.kept + model.n_ends + (self.run.number * model.channels + channel) * TRACES
-        yield first_trace + traces, last + traces, np.ones(TRACES)
+        yield from self.of_sensor(channel, first[3], last)
+        beside = last + len(self.trace_spectra) + 2 * d * model.gains
+        for side, mode in enumerate(model.coupled.T[: 1 + model.force]):
+            pairs = np.arange(mode.size)
+            yield model.coupling.start + pairs, beside + side * mode.size + pairs, shapes[mode]
+
+    def spectra(self, base: ComplexArray) -> ComplexArray:
+        """Spectra of which all columns are made, those of couplings that are still zero at last."""
+        plain, pairs = super().spectra(base), self.records.coupled
+        if not len(pairs):
+            return plain
+        moved, moving = np.vstack([pairs, pairs[:, ::-1]])[: len(pairs) * (1 + self.records.force)].T
+        by = -1j * np.divide(self.g, self.run.w, out=np.zeros_like(self.g), where=self.run.w > 0)
+        return np.concatenate([plain, by[moved] * plain[moving]])
+
+    def of_motion(self, channel: int, base: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """Entries of what multiplies the motions of the modes, and that of the base, whose spectra begin at `base`."""
+        model, k, one = self.records, np.arange(self.records.m), np.ones(1)
+        n, d, index = model.n, model.d, model.index
+        if channel < n:
+            yield index.phi.start + channel * model.m + k, k, np.ones(model.m)
+            return
+        yield index.gamma.start + k * d + channel - n, k, np.ones(model.m)
+        for at, (a, b) in enumerate(index.pairs):
+            if channel - n in (a, b):
+                yield index.rigid[[at]], np.array([base + (b if channel - n == a else a)]), one
+
+    def of_sensor(
+        self, channel: int, base: int, last: int
+    ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """Entries of a channel's traces, whose spectra begin at `last`, and of a sensor's gain."""
+        model, n, d = self.records, self.records.n, self.records.d
+        beside, traces = np.arange(d), np.arange(len(self.trace_spectra))
+        first_trace = model.kept + model.n_ends + (self.run.number * model.channels + channel) * traces.size
+        yield first_trace + traces, last + traces, np.ones(traces.size)
         if model.gains and channel < n:
-            yield model.n_fit + channel * d + beside, first[3] + beside, np.ones(d)
+            yield model.n_fit + channel * d + beside, base + beside, np.ones(d)
             for kind in (1, 2):
                 column = model.n_fit + (kind * n + channel) * d + beside
-                yield column, last + TRACES + (kind - 1) * d + beside, np.ones(d)
+                yield column, last + traces.size + (kind - 1) * d + beside, np.ones(d)
 
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""
@@ -324,6 +381,60 @@ class Chunk(Lines):
     def products(self, levels: Array, columns: Columns) -> NormalEquations:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
         return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
+
+
+class CoupledChunk(Chunk):
+    """The same of modes that dampers couple: each load moves all of them."""
+
+    def spectra(self, base: ComplexArray) -> ComplexArray:
+        """Motions; those of each mode by each load of the base; slopes by poles, base; couplings; ends; traces, gains.
+
+        With A the flexibility, a change D of what it is the inverse of moves the motions q by ``-A D q``.
+        """
+        modes, A, w, size = self.p.modes, self.flexibility, self.run.w, base.shape[1]
+        w_a = w**2 * A
+        q = np.einsum("jkl,kl->jl", w_a, real_times(modes.gamma, base) + self.pushed_by_ends)
+        loss = 2j * (modes.ratios * modes.omega)[:, None] * w
+        slopes = [A * (-by * q) for by in (2 * modes.omega[:, None] ** 2 + loss, loss)]
+        one, other = self.records.coupled.T
+        turned = A[:, one] * q[other]
+        if self.records.force:
+            turned += A[:, other] * q[one]
+        parts = [q, w_a[:, :, None] * base, *slopes, base, -1j * w * turned]
+        if self.at_ends is not None:
+            parts.append(w_a[:, :, None] * self.transients)
+        parts.append(self.trace_spectra)
+        if self.records.gains:
+            parts.append(modes_above(w / (2 * np.pi), self.records.test.freq[-1])[:, None] * base)
+        return np.concatenate([part.reshape(-1, size) for part in parts])
+
+    def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """See `Chunk`."""
+        model = self.records
+        m, d, index, k = model.m, model.d, model.index, np.arange(model.m)
+        shapes, pairs = self.shapes[channel], len(model.coupled)
+        sizes = [m, m * m * d, m * m, m * m, d, m * pairs]
+        first = np.cumsum([0, *sizes])
+        yield from self.of_motion(channel, int(first[4]))
+        rows = [
+            index.gamma.start + np.arange(m * d), index.log_omega.start + k, index.log_ratios.start + k,
+            model.coupling.start + np.arange(pairs),
+        ]  # fmt: skip
+        starts, last = [first[1], first[2], first[3], first[5]], first[6]
+        if self.at_ends is not None:
+            runs = 2 * len(model.moving)
+            rows.append((model.kept + k[:, None] * runs + self.at_ends.start + np.arange(2)).ravel())
+            starts, last = [*starts, last], last + 2 * m * m
+        for row, start in zip(rows, starts, strict=True):
+            spectra = start + np.arange(m * row.size)
+            yield np.tile(row, m), spectra, np.repeat(shapes, row.size)
+        yield from self.of_sensor(channel, int(first[4]), int(last))
+
+
+def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:
+    """Pairs of different modes, (k, 2), each once or, with `both`, in both orders."""
+    apart = np.argwhere(~np.eye(m, dtype=bool))
+    return apart if both else apart[apart[:, 0] < apart[:, 1]]
 
 
 def segments(w: Array, most: int = 20, lines: int = 4) -> list[slice]:

@@ -26,7 +26,7 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, unit_diagonal
-from sysid.modal_analysis.record_model import Chunk, Parameters, RecordModel, Run
+from sysid.modal_analysis.record_model import Parameters, Run
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
 
@@ -197,12 +197,12 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     N, size = unit_diagonal(fit.normal)
     half, size = half_inverse(N, 1e-12), np.where(model.held, np.inf, size)
     meat = np.zeros((half.shape[1],) * 2)
-    columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
+    columns = [model.chunk(p, run.at(slice(0, 1))).columns() for run in model.runs]
     for shift in np.arange(partitions) / partitions:
         for run, run_columns in zip(model.runs, columns, strict=True):
             at = size[run_columns.unknowns]
             for lines in line_blocks(run, fit, shift):
-                products = Chunk(model, p, run.at(lines)).products(fit.levels, run_columns)
+                products = model.chunk(p, run.at(lines)).products(fit.levels, run_columns)
                 score = half[run_columns.unknowns].T @ (products.gradient / at)
                 inner = half[run_columns.unknowns].T @ (products.normal / np.outer(at, at)) @ half[run_columns.unknowns]
                 taken, turn = np.linalg.eigh(inner)
@@ -273,7 +273,7 @@ def _moving(fit: RecordFit, runs: tuple[int, ...]) -> tuple[RecordFit, Parameter
 
 def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
-    model = RecordModel(fit.test, p.modes.omega.size, static=fit.static)
+    model = fit.model_of(p)
     equations = model.normal_equations(p, fit.levels)
     N, size = unit_diagonal(equations.normal)
     gradient = equations.gradient / size

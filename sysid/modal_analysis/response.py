@@ -203,6 +203,16 @@ def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> Compl
     return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
 
 
+def coupled_flexibility(freq: Array, omega: Array, ratios: Array, coupling: Array) -> ComplexArray:
+    """Inverse of ``w_k² - w² + i w (2 zeta_k w_k + Z)`` of modes that dampers couple, (m, m, n_freq), s²/rad².
+
+    Z (m, m), rad/s, is `coupling`, with zeros on its diagonal. Modal motions are w² times that times their loads.
+    """
+    s = 2j * np.pi * freq[:, None, None]
+    dynamic = np.diag(omega**2) + s**2 * np.eye(omega.size) + s * (np.diag(2 * ratios * omega) + coupling)
+    return np.ascontiguousarray(np.moveaxis(np.linalg.inv(dynamic), 0, -1))
+
+
 def modes_above(freq: Array, last: float) -> Array:
     """Functions w² and of a pole not far above the last line, Hz, which modes above the lines add, (2, n_freq)."""
     s = freq / last

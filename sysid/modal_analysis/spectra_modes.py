@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.coupled_spectra import with_couplings_of_lines
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import (
     STATIC_POLE,
@@ -92,9 +93,10 @@ def fit_modes_of_lines(
     if residual:
         found = fit.with_poles_above(found)
     modes = found.modes.at(np.argsort(found.modes.omega, kind="stable"))
-    return replace(
+    modal = replace(
         modal, **modes._asdict(), rigid=found.rigid, fit=replace(found, modes=modes), static=found.static
     )  # fmt: skip
+    return with_couplings_of_lines(modal, monitor, max_iterations)
 
 
 @dataclass(frozen=True, eq=False)

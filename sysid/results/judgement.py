@@ -187,9 +187,12 @@ def _structure(problem: Prepared, first: Structure, before: Array, after: Array,
         left = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
     M_SS = P.T @ P
     delta = end.gamma - P @ G
+    loss = first.modal_damping_matrix[np.ix_(order, order)]
+    loss = loss - np.diag(np.diag(loss)) + np.diag(2 * end.ratios * end.omega)
     return assemble(
-        M_SS, P.T @ end.gamma - M_SS @ G, delta.T @ delta + left, (P.T * end.omega**2) @ P, G, ratios=end.ratios,
-        test=problem.measurement,
+        M_SS, P.T @ end.gamma - M_SS @ G, delta.T @ delta + left, (P.T * end.omega**2) @ P, G,
+        ratios=end.ratios if first.modal_damping else None,
+        damping=None if first.modal_damping else P.T @ loss @ P, test=problem.measurement,
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.modal_estimate import residual_of
+from sysid.modal_analysis.modal_estimate import index_of, residual_of, theta_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
@@ -134,10 +134,11 @@ class Modal:
 
 def structure_of_modes(
     problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool,
-    residual: ResidualModes,
+    residual: ResidualModes, coupling: Array | None = None,
 ) -> Structure:  # fmt: skip
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
+    Dampers that couple the modes have ``Phi' C Phi`` off its diagonal, `coupling` (m, m), rad/s.
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
     """
     geometry = problem.geometry
@@ -158,7 +159,8 @@ def structure_of_modes(
     return Structure(
         np.block([[M_SS, M_S0], [M_S0.T, delta.T @ delta + remainder]]),
         np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
-        modes.ratios,
+        modes.ratios if coupling is None else None,
+        damping_matrix=None if coupling is None else P.T @ (np.diag(2 * modes.ratios * modes.omega) + coupling) @ P,
         n_base=geometry.d,
         recovery=None if plain else recovery,
         rigid_body=None if plain else geometry.rigid_body,
@@ -305,7 +307,9 @@ def modal_structure(
     kept = mass.totals is not None and held is None and not later and end.modes.omega.min() >= 2 * np.pi * test.freq[0]
     unmet = mass.free and (test.force is None or kept)
     try:
-        structure = structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet, residual=residual)
+        structure = structure_of_modes(
+            problem, modes, remainder, chosen, to_totals=unmet, residual=residual, coupling=_coupling(problem, end)
+        )  # fmt: skip
         return structure, end, chosen, poles
     except InputError as error:
         raise DoesNotApplyError(
@@ -320,6 +324,16 @@ def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     others = end.modes.at(~inside)
     residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, end.static)
     return end.modes.at(inside), residual
+
+
+def _coupling(problem: Prepared, end: ModalFit) -> Array | None:
+    """Couplings of the modes of the structure by dampers, (m, m), as they follow where a fit ended; None without."""
+    modal = problem.modal[0]
+    if modal.coupling is None:
+        return None
+    index, inside = index_of(modal), problem.of_structure(end.modes.omega)
+    step = theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index)
+    return modal.coupling.about(step)[np.ix_(inside, inside)]
 
 
 def _modes_asked(problem: Prepared, options: Modal) -> int | None:

@@ -63,6 +63,8 @@ class Structure:
         ``M Phi diag(2 zeta w) Phi' M`` (Cerini et al. 2024, eq. 33).
     damping_ratios : (n,)
         As given, or ``diag(Phi' C Phi) / 2 w``.
+    modal_damping_matrix : (n, n)
+        ``Phi' C Phi``, rad/s: diagonal where the damping is classical.
     modal_damping : bool
         Whether ratios were given, so that responses are modal sums; else they are direct solves.
     natural_frequencies : (n,)
@@ -319,7 +321,7 @@ class Structure:
         samples = np.shape(base)[-1] if np.ndim(base) else 0
         measured = shaped_array("response", response, self.n_sensors, samples)
         left = measured - self.simulate(base, sample_rate)
-        own = ModalModel(self._omega, self._modal_damping_matrix, self.participation)
+        own = ModalModel(self._omega, self.modal_damping_matrix, self.participation)
         return fitted_state(own, self.mode_shapes, left, sample_rate)
 
     @property
@@ -329,7 +331,7 @@ class Structure:
         loss = np.diag(2 * beyond.damping_ratios * beyond.omega)
         return ModalModel(
             np.concatenate([self._omega, beyond.omega]),
-            scipy.linalg.block_diag(self._modal_damping_matrix, loss),
+            scipy.linalg.block_diag(self.modal_damping_matrix, loss),
             np.vstack([self.participation, beyond.participation]),
         )
 
@@ -453,7 +455,7 @@ class Structure:
             if np.linalg.eigvalsh(modal)[0] < -EXACT * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
             self.damping_ratios = np.diag(modal) / (2 * self._omega)
-        self._modal_damping_matrix: Array = modal
+        self.modal_damping_matrix: Array = modal
 
     def _sensor_rigid_body(self, given: ArrayLike | None, recovered: bool) -> Array:
         implied = self.recovery @ self.rigid_body_dofs

@@ -84,9 +84,20 @@ class TestDamping:
         truth = building(dashpot=0.05)
         assert said(simulate(truth, lines(truth), noise=0.05, rng=0), modal_twin(truth)) == []
 
-    def test_the_identified_structure_is_doubted_and_not_called_known(self):
+    def test_the_identified_structure_has_the_dashpot_in_its_damping_matrix(self):
         truth = building(dashpot=25.0)
         test = simulate(truth, lines(truth), noise=0.001, force=True, rng=0)
+        result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert result.structure.n == 3 and not result.structure.modal_damping
+        off = np.abs(result.structure.damping - truth.damping) / result.uncertainty.damping
+        assert off.max() < 4 and np.all(result.uncertainty.damping < 0.1 * truth.damping.max())
+        assert result.determined and not result.contradictions
+        (note,) = result.of_kind("damping")
+        assert note.severity == "note" and note.numbers["deviations"] > 10
+
+    def test_without_a_force_it_is_doubted_and_not_called_known(self):
+        truth = building(dashpot=25.0)
+        test = simulate(truth, lines(truth), noise=0.001, rng=0)
         result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
         assert result.structure.n == 3
         assert not result.determined

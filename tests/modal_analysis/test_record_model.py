@@ -51,7 +51,7 @@ def test_transform_of_a_moving_record_is_the_response_and_two_numbers() -> None:
     assert np.linalg.norm(g * inputs) > 0.1 * np.linalg.norm(exact)  # the numbers matter
 
 
-def _model(force: bool, d: int) -> tuple[RecordModel, Parameters, Array]:
+def _model(force: bool, d: int, coupled: bool = False) -> tuple[RecordModel, Parameters, Array]:
     """Two runs of unequal length, one at rest; data and parameters at random, so that no error is small."""
     r = np.random.default_rng(3)
     n, m, rate = 3, 2, 20.0
@@ -60,11 +60,12 @@ def _model(force: bool, d: int) -> tuple[RecordModel, Parameters, Array]:
         runs, rate, rigid_body=r.normal(size=(n, d)) / 4, band=(1.0, 9.0), at_rest=[False, True],
         base_axes="xyz"[:d],
     )  # fmt: skip
-    model = RecordModel(test, m)
+    model = RecordModel(test, m, coupled=coupled)
     rigid = (2.0 * np.eye(d) + 0.1) if force else np.zeros((d, d))
     modes = Modes(r.normal(size=(n, m)), r.normal(size=(m, d)), np.array([15.0, 35.0]), np.array([0.06, 0.1]))
     traces = r.normal(size=(2, model.channels, 3))
-    p = Parameters(modes, rigid, r.normal(size=(m, 2)), traces)
+    coupling = np.array([[0.0, 0.8], [0.8 if force else -0.5, 0.0]]) if coupled else None
+    p = Parameters(modes, rigid, r.normal(size=(m, 2)), traces, coupling)
     return model, p, r.uniform(0.3, 2.0, (2, model.channels + d))
 
 
@@ -82,18 +83,20 @@ def _dense_chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
     return total
 
 
-CASES = pytest.mark.parametrize(("force", "d"), [(True, 1), (False, 1), (True, 2), (False, 2)])
+CASES = pytest.mark.parametrize(
+    ("force", "d", "coupled"), [(f, d, c) for f in (True, False) for d in (1, 2) for c in (False, True)]
+)
 
 
 @CASES
-def test_whitened_errors_sum_to_those_of_the_dense_covariance(force: bool, d: int) -> None:
-    model, p, levels = _model(force, d)
+def test_whitened_errors_sum_to_those_of_the_dense_covariance(force: bool, d: int, coupled: bool) -> None:
+    model, p, levels = _model(force, d, coupled)
     assert model.chi2(p, levels) == pytest.approx(_dense_chi2(model, p, levels), rel=1e-10)
 
 
 @CASES
-def test_gradient_is_that_of_the_sum_with_covariance_varying(force: bool, d: int) -> None:
-    model, p, levels = _model(force, d)
+def test_gradient_is_that_of_the_sum_with_covariance_varying(force: bool, d: int, coupled: bool) -> None:
+    model, p, levels = _model(force, d, coupled)
     made, x = model.normal_equations(p, levels), model.pack(p)
     h = 1e-5
     slope = [
@@ -106,17 +109,17 @@ def test_gradient_is_that_of_the_sum_with_covariance_varying(force: bool, d: int
 
 
 @CASES
-def test_normal_matrix_is_that_of_derivatives_at_the_likeliest_base(force: bool, d: int) -> None:
-    model, p, levels = _model(force, d)
+def test_normal_matrix_is_that_of_derivatives_at_the_likeliest_base(force: bool, d: int, coupled: bool) -> None:
+    model, p, levels = _model(force, d, coupled)
     made, x, h = model.normal_equations(p, levels), model.pack(p), 1e-5
     dense = np.zeros_like(made.normal)
     for run in model.runs:
-        here = Chunk(model, p, run)
+        here = model.chunk(p, run)
         S, T = _dense(here, levels), np.moveaxis(here.H, -1, 0)
         pulled = np.einsum("lcd,lc->ld", T.conj(), np.linalg.solve(S, here.error.T[..., None])[..., 0])
         likely = run._replace(base=run.base + (run.density * levels[run.number, model.channels :] * pulled).T)
         J = np.array([
-            (Chunk(model, model.unpack(x - h * u), likely).error - Chunk(model, model.unpack(x + h * u), likely).error)
+            (model.chunk(model.unpack(x - h * u), likely).error - model.chunk(model.unpack(x + h * u), likely).error)
             / (2 * h)
             for u in np.eye(x.size)
         ])  # fmt: skip
@@ -141,9 +144,9 @@ def test_lines_of_unequal_runs_are_their_own_transforms() -> None:
 
 
 @CASES
-def test_weights_of_lines_count_in_sum_gradient_and_normal_matrix(force: bool, d: int) -> None:
+def test_weights_of_lines_count_in_sum_gradient_and_normal_matrix(force: bool, d: int, coupled: bool) -> None:
     """Weights of 0, 1 and 2: a line that is left out, as it is, and twice there."""
-    model, p, levels = _model(force, d)
+    model, p, levels = _model(force, d, coupled)
     weights = [np.arange(run.w.size) % 3 for run in model.runs]
     weighed = model.weighed_by([weight.astype(float) for weight in weights])
     parts = []
@@ -164,9 +167,9 @@ def test_weights_of_lines_count_in_sum_gradient_and_normal_matrix(force: bool, d
 
 
 @CASES
-def test_what_transients_take_off_the_information_is_as_they_move_along(force: bool, d: int) -> None:
+def test_what_transients_take_off_the_information_is_as_they_move_along(force: bool, d: int, coupled: bool) -> None:
     """The covariance of the modes is that part of the inverse of all unknowns' normal matrix."""
-    model, p, levels = _model(force, d)
+    model, p, levels = _model(force, d, coupled)
     normal = model.normal_equations(p, levels).normal
     made = RecordFit(model.test, p, levels, 1.0, True).information()[: model.kept, : model.kept]
     inner, across = normal[model.kept :, model.kept :], normal[model.kept :, : model.kept]
@@ -206,9 +209,9 @@ def test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_l
 
 
 @CASES
-def test_the_likelihood_is_that_of_the_dense_covariance(force: bool, d: int) -> None:
+def test_the_likelihood_is_that_of_the_dense_covariance(force: bool, d: int, coupled: bool) -> None:
     """Of circular complex errors, but for the powers of pi; between two sets of levels as well."""
-    model, p, levels = _model(force, d)
+    model, p, levels = _model(force, d, coupled)
     for at in (levels, levels[::-1] ** 2):
         fit = RecordFit(model.test, p, at, model.chi2(p, at), True)
         exponents = [np.sum(np.linalg.slogdet(_dense(chunk, at))[1]) for chunk in model.chunks(p)]
@@ -216,9 +219,9 @@ def test_the_likelihood_is_that_of_the_dense_covariance(force: bool, d: int) -> 
 
 
 @CASES
-def test_unknowns_are_as_many_as_the_records_determine(force: bool, d: int) -> None:
+def test_unknowns_are_as_many_as_the_records_determine(force: bool, d: int, coupled: bool) -> None:
     """The rank of the normal matrix: without a force the scale of each mode is not seen."""
-    model, p, levels = _model(force, d)
+    model, p, levels = _model(force, d, coupled)
     normal = model.normal_equations(p, levels).normal
     size = np.sqrt(np.diag(normal))
     lam = np.linalg.eigvalsh(normal / np.outer(size, size))
@@ -239,3 +242,14 @@ def test_chi_squared_of_right_modes_and_levels_is_its_degrees_of_freedom() -> No
     p = Parameters(modes, np.zeros((d, d)), np.zeros((1, 2)), np.zeros((1, n, 3)))
     fit = RecordFit(test, p, levels[None], model.chi2(p, levels[None]), True)
     assert fit.reduced == pytest.approx(1.0, abs=4 * np.sqrt(2 / fit.freedom))
+
+
+@pytest.mark.parametrize("force", [True, False])
+@pytest.mark.parametrize("gains", [True, False])
+def test_equations_of_couplings_that_are_zero_need_no_coupled_modes(force: bool, gains: bool) -> None:
+    model, p, levels = _model(force, 2, coupled=True)
+    model = RecordModel(model.test, model.m, gains=gains, coupled=True)
+    plain = model.normal_equations(replace(p, coupling=None), levels)
+    general = model.normal_equations(replace(p, coupling=np.zeros((2, 2))), levels)
+    np.testing.assert_allclose(plain.normal, general.normal, atol=1e-12 * np.abs(general.normal).max())
+    np.testing.assert_allclose(plain.gradient, general.gradient, atol=1e-12 * np.abs(general.gradient).max())

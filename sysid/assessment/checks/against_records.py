@@ -79,7 +79,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
         found = leaks = list(leakage(test, structure))
     if not (leaks or misses or rigid):
         found += _twins(modal, structure)
-    return found
+    return [*found, *_couplings(modal, structure)]
 
 
 def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
@@ -128,7 +128,7 @@ def _misfit(
 def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
     """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test = modal.records
-    if modal.by_modes:  # beside the noise of the base, which biases what follows
+    if modal.of_records:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
     else:
         found = _along_the_base(test, records, free)
@@ -194,6 +194,26 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
             "mode is missing; modal damping ratios are then an approximation",
             numbers={"share": share},
         )  # fmt: skip
+
+
+def _couplings(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
+    """Dampers couple modes, and the damping matrix holds it: its share, and the coupling that stands out most."""
+    found, test = modal.coupling, modal.records
+    if found is None or structure.modal_damping:
+        return
+    twin = Structure.from_tree(structure.to_tree() | {
+        "damping_ratios": structure.damping_ratios, "damping_matrix": None
+    })  # fmt: skip
+    share = float(np.linalg.norm(test.predict(structure) - test.predict(twin)) / np.linalg.norm(test.relative))
+    values = found.values[*found.pairs.T]
+    most = int(np.argmax(np.abs(values) / modal.coupling_std))
+    (first, second), deviations = modal.omega[found.pairs[most]] / (2 * np.pi), values[most] / modal.coupling_std[most]
+    yield Finding(
+        "damping", Severity.NOTE,
+        f"the damping is not classical: dampers couple the modes, by {100 * share:.2g} % of the response, most surely "
+        f"those at {first:.4g} and {second:.4g} Hz ({abs(deviations):.2g} deviations); the damping matrix holds it",
+        numbers={"share": share, "deviations": float(abs(deviations)), "first": float(first), "second": float(second)},
+    )  # fmt: skip
 
 
 def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:

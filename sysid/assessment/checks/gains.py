@@ -87,7 +87,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     unknown = GainErrors(nothing, nothing, np.zeros(test.n_sensors), 1)
     if below_lines(test, structure).size:
         return unknown
-    if modal.by_modes:
+    if modal.of_records:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)

@@ -1,0 +1,110 @@
+"""Modes that dampers couple, as a dashpot between two floors does: where the records ask for the couplings, and values.
+
+The off-diagonal entries Z of ``Phi' C Phi`` make mode shapes complex: to first order that of mode k is
+``phi_k + sum_j i w_k Z_jk phi_j / (w_k² - w_j²)``, so that residues have a part in quadrature, which further modes
+beside each peak would mimic. The model holds Z itself, exact for any size of it and for close modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_estimate import Coupling
+from sysid.modal_analysis.modal_model import NormalEquations, Parameters
+from sysid.modal_analysis.model_order import least_worth
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    RecordFit,
+    half_inverse,
+    refitted,
+    unit_diagonal,
+    without,
+    worth,
+)
+from sysid.modal_analysis.record_model import RecordModel
+from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF, beyond_chance
+
+
+def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[float, int]:
+    """Fall of twice the sum of squares that couplings promise in one step (Rao 1948), and how many show."""
+    N, size = unit_diagonal(equations.normal)
+    gradient, own = equations.gradient / size, np.zeros(model.size, bool)
+    own[model.coupling] = True
+    half = half_inverse(N[np.ix_(~own, ~own)], ROUND_OFF)
+    across = half.T @ N[np.ix_(~own, own)]
+    left = gradient[own] - across.T @ (half.T @ gradient[~own])
+    lam, V = np.linalg.eigh(N[np.ix_(own, own)] - across.T @ across)
+    seen = lam > ROUND_OFF
+    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
+
+
+def passive(p: Parameters) -> bool:
+    """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite."""
+    assert p.coupling is not None
+    loss = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2
+    return bool(np.linalg.eigvalsh(loss)[0] >= 0)
+
+
+def with_couplings(
+    fit: RecordFit, pruned: Callable[[RecordFit], RecordFit], *, monitor: FitMonitor, some: Measurement | None = None
+) -> RecordFit:
+    """The fit with couplings of its modes, where the records ask for them beyond chance; `some` as in `refitted`.
+
+    Modes that stood for couplings leave nothing else to determine: `pruned` takes them out of a rough fit.
+    """
+    p, m = fit.parameters, fit.model.m
+    if p.coupling is not None or m - fit.static < 2:
+        return fit
+    # Beside what a wrong gain or modes above the lines make, which couplings would mimic.
+    model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True)
+    beyond = max(fit.reduced, 1.0)
+    promised, count = score_of_couplings(model, model.normal_equations(p, fit.levels))
+    if promised < beyond * beyond_chance(count):
+        return fit
+    first = replace(p, coupling=np.zeros((m, m)))
+    monitor.doing = f"{m} modes and the dampers between them"
+    rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor))
+    more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
+    while more.model.m > 2:  # one that stood for couplings may be worth much beside these, until the others have moved
+        poorest = np.arange(more.model.m) == np.argmin(worth(more))
+        fewer = refitted(more, without(more, poorest), some=some, limits=TRIAL, monitor=monitor)
+        if not fewer.settled or more.likelihood - fewer.likelihood > least_worth(more.model):
+            break
+        more = fewer
+    gained = 2 * (more.likelihood - fit.likelihood)
+    least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
+    return more if more.settled and passive(more.parameters) and gained > beyond * least else fit
+
+
+def coupling_of(
+    model: RecordModel, p: Parameters, normal: Array, order: NDArray[np.intp], at: NDArray[np.intp]
+) -> Coupling | None:
+    """Couplings at the end of a fit, of modes and unknowns of `Index` in this order; None where they mean nothing.
+
+    `normal` is the normal matrix of all unknowns.
+    """
+    if p.coupling is None or not model.force:
+        return None
+    N, size = unit_diagonal(normal)
+    kept, own = np.arange(model.kept), np.arange(model.coupling.start, model.coupling.stop)
+    others = np.arange(model.kept, model.coupling.start)
+    half = half_inverse(N[np.ix_(others, others)], ROUND_OFF)
+    turned = half.T @ N[others]
+    N = N - turned.T @ turned
+    inverse = half_inverse(N[np.ix_(own, own)], ROUND_OFF)
+    inverse = inverse @ inverse.T
+    follows = np.zeros((own.size, model.index.size))
+    follows[:, kept] = -(inverse @ N[np.ix_(own, kept)]) / size[own, None] * size[kept]
+    covariance = inverse / 2 / np.outer(size[own], size[own])
+    place = np.argsort(order)
+    return Coupling(
+        p.coupling[np.ix_(order, order)], np.sort(place[model.coupled], axis=1), follows[:, at], covariance
+    )  # fmt: skip
