@@ -25,9 +25,9 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.modal import objective_of
-from sysid.search.modal_program import to_stated_totals
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session, TimeIsOver, within
+from sysid.search.stated_masses import to_stated_totals
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY

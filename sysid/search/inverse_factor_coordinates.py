@@ -30,7 +30,8 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import IterationMonitor, NonlinearProgram, product, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import modes_of, spectrum_near, unknowns_of
-from sysid.search.modal_program import End, stated_totals
+from sysid.search.modal_program import End
+from sysid.search.stated_masses import stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 

@@ -33,18 +33,9 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom, sensors_by_name
 from sysid.search.local import LocalResult, solve
-from sysid.search.modal_program import (
-    End,
-    Spectrum,
-    Ties,
-    fit_apart,
-    nearest_lumped,
-    of_known_mass,
-    solve_modes,
-    stated_totals,
-    to_stated_totals,
-)
+from sysid.search.modal_program import End, Spectrum, Ties, fit_apart, solve_modes
 from sysid.search.session import Session
+from sysid.search.stated_masses import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.superelement import ResidualModes

@@ -22,7 +22,8 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
-from sysid.search.modal_program import End, add_unknowns, positive_part, solve_modes, stated_totals, to_stated_totals
+from sysid.search.modal_program import End, add_unknowns, solve_modes
+from sysid.search.stated_masses import positive_part, stated_totals, to_stated_totals
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FREE, NEGLIGIBLE
 

@@ -197,8 +197,7 @@ class Structure:
     @property
     def at_sensors(self) -> bool:
         """True where the degrees of freedom are the sensors, one each and in their order."""
-        alone = self.n == self.n_sensors and self.residual.count == 0
-        return alone and np.array_equal(self.recovery, np.eye(self.n))
+        return not self.residual.count and np.array_equal(self.recovery, np.eye(self.n_sensors))
 
     @property
     def dof_modes(self) -> NDArray[np.intp]:

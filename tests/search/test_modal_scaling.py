@@ -10,7 +10,7 @@ from sysid.modal_analysis.modal_fit import ModalFit, Modes, weigh
 from sysid.modal_analysis.response import weighted_error
 from sysid.nlp import IterationMonitor
 from sysid.search.modal import held_to_totals
-from sysid.search.modal_program import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.stated_masses import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
 
 
 def lines(truth, count=200):
