@@ -223,6 +223,7 @@ TRIED = (
         "return bool(count and np.linalg.eigvalsh(slope)[0] < -NEGLIGIBLE * left)", "return False",
         "test_modal_program::test_a_start_without_base_mass_ends_where_one_with_all_of_it_does"),
     Mutant("K43", "a start is left out wherever another has been at the same step",
-        "return any(apart(self.problem, x, way[step]) < SAME_ANSWER", "return any(apart(self.problem, x, way[step]) < 1e9",
+        "return any(apart(self.problem, x, way[step]) < SAME_ANSWER",
+        "return any(apart(self.problem, x, way[step]) < 1e9",
         "test_continuation"),
 )  # fmt: skip

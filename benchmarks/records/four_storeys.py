@@ -48,7 +48,7 @@ class Statement:
 
 def lines(reduced: bool) -> Iterator[Line]:
     """By statement: 100 draws of motion and noise each, or 6."""
-    draws = 6 if reduced else 100
+    draws = 4 if reduced else 100
     trials = spread(draw, [(name, number) for name in STATEMENTS for number in range(draws)])
     for name, statement in STATEMENTS.items():
         own = [t for t in trials if t.group == name]
