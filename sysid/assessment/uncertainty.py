@@ -411,11 +411,8 @@ def separated_modes(structure: Structure) -> Modes:
 def _all_modes(structure: Structure) -> Modes:
     """`separated_modes` with the residual ones among them, ascending."""
     own, beyond = separated_modes(structure), structure.residual
-    every = Modes(
-        np.hstack([own.phi, beyond.shapes]), np.vstack([own.gamma, beyond.participation]),
-        np.concatenate([own.omega, beyond.omega]),
-        np.concatenate([own.ratios, np.maximum(beyond.damping_ratios, NEGLIGIBLE)]),
-    )  # fmt: skip
+    ratios = np.maximum(beyond.damping_ratios, NEGLIGIBLE)
+    every = own.joined(Modes(beyond.shapes, beyond.participation, beyond.omega, ratios))
     return every.at(np.argsort(every.omega, kind="stable"))
 
 

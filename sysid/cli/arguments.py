@@ -313,7 +313,7 @@ def _add_kinds(refine: argparse.ArgumentParser) -> None:
         type=functools.partial(_whole, 2),
         metavar="N",
         help="fits of N sets of records that the result would have given, with noise drawn anew: their spread beside "
-        "the linear uncertainty",
+        "the linear uncertainty; an answer in the band, or with coupled damping, is identified anew from each",
     )
     kinds.add_argument(
         "--leave-out",

@@ -127,8 +127,9 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
 def tell_excited_band(recipe: Recipe, out: Output) -> None:
     """Tell the band that the base excites, of a run of records that ``sysid read`` wrote, and whether it is fitted."""
     if recipe.module == _MODULE and recipe.data is not None:
-        stated = {name for name in ("band", "estimator") if recipe.parameters.get(name) is not None}
-        use = "other lines were asked for" if stated else "these lines are fitted, and --band LOW-HIGH takes others"
+        asked = recipe.parameters
+        others = asked.get("band") is not None or asked.get("estimator") not in (None, "records")
+        use = "other lines were asked for" if others else "these lines are fitted, and --band LOW-HIGH takes others"
         tell_band(recorded_test.load(recipe.data), use, out)
 
 

@@ -138,7 +138,8 @@ class WithoutSensor:
 
     def predicted(self, problem: Prepared, result: Identification) -> float:
         """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
-        if problem.free_modes or result.x is None:
+        # Residual modes of the whole test would be fitted to the sensor that is to be predicted.
+        if problem.free_modes or problem.formulation.residual_modes or result.x is None:
             return np.nan
         test = without_transients_of(problem.measurement, problem.structure(result.x))
         left, measured = test.relative - test.predict(problem.structure(result.x)), test.relative

@@ -40,7 +40,7 @@ class Job:
     recipe: Recipe
     start: int  # 0 is the recipe's own where it has one; all others are fresh points of the search space
     source: str  # tells what one problem is made from, from another's
-    draw: int = 0  # of noise, from 1; by gradients from where the recipe starts. 0 fits the records themselves
+    draw: int = 0  # of noise, from 1, fitted from the recipe's start. 0 fits the records themselves
     strategy: str = ""  # by which the problem is identified whole; empty for the local phase alone
     change: Change | None = None  # of the problem that is identified whole
 

@@ -273,10 +273,15 @@ def _parameters(result: Identification) -> int:
     problem, s = result.prepared, result.structure
     formulation = problem.formulation
     if result.x is not None and not problem.free_modes:
-        return sensitivity(formulation, result.x, priors=False).rank
+        beyond = sum(term.matrices.beyond.size for term in formulation.tests)
+        return sensitivity(formulation, result.x, priors=False).rank + beyond
     (n, m), d = s.mode_shapes.shape, s.n_base
     ratios = m if formulation.damping.free else min(m, sum(v.size for v in formulation.of_models[2]))
-    if problem.measurement.force is None:
+    ratios += m * (m - 1) // 2 * (not s.modal_damping)
+    static, weighed = s.residual.static, problem.measurement.force is not None
+    others = s.residual.count - static  # residual modes with poles of their own
+    ratios += others * (n + d + 1 + weighed) + static * n + weighed * static * (static + 1) // 2
+    if not weighed:
         # A frequency, and a shape times a participation.
         return m * (n + d) + ratios
     # The force weighs each mode, and what no mode carries, unless that was stated.

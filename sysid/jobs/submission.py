@@ -153,8 +153,8 @@ def submit(
         Of each recipe.
     draws : int
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
-        size that was stated or found, drawn anew for each. With `strategy`, of an answer that tells no unknowns: whole
-        identifications, of as many modes as the answer of the records themselves.
+        size that was stated or found, drawn anew for each. With ``strategy="modal"``, of an answer that tells no
+        unknowns: whole identifications, of as many modes as the answer of the records themselves.
     changes : sequence of Band, WithoutRun, WithoutSensor, NumberOfModes or None
         In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
     strategy : str
@@ -196,8 +196,8 @@ def submit(
     )
     starts, draws = whole_number("starts", starts, at_least=1), whole_number("draws", draws, at_least=0)
     lacking = draws and (starts > 1 or (not strategy and any(one.start is None for one in recipes)))
-    wanted = "draws need Recipe.start, the unknowns that were identified, or a strategy, and exclude starts"
-    refuse((lacking, wanted))
+    wanted = "draws need Recipe.start, the unknowns that were identified, or strategy='modal', and exclude starts"
+    refuse((lacking or (draws and strategy not in ("", "auto", "modal")), wanted))
     if changes != ():
         changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor, NumberOfModes or None")
     by = _strategy(strategy, changes, starts > 1 or (draws > 0 and changes != ()))
@@ -227,7 +227,7 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
         (wrong, f"changes holds a {', '.join(wrong[:1])}; give Band, WithoutRun, WithoutSensor or NumberOfModes"),
         (
             others and (changes or strategy),
-            "changes and strategy stand for whole identifications, and exclude starts, and changes draws",
+            "give changes or a strategy without starts, and changes without draws",
         ),
         (strategy not in ("", "auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
     )

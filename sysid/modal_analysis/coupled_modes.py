@@ -24,6 +24,7 @@ from sysid.modal_analysis.record_fit import (
     RecordFit,
     half_inverse,
     refitted,
+    score,
     unit_diagonal,
     without,
     worth,
@@ -34,16 +35,10 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 
 def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[float, int]:
-    """Fall of twice the sum of squares that couplings promise in one step (Rao 1948), and how many show."""
-    N, size = unit_diagonal(equations.normal)
-    gradient, own = equations.gradient / size, np.zeros(model.size, bool)
+    """Fall of twice the sum of squares that couplings promise in one step, and how many show."""
+    own = np.zeros(model.size, bool)
     own[model.coupling] = True
-    half = half_inverse(N[np.ix_(~own, ~own)], ROUND_OFF)
-    across = half.T @ N[np.ix_(~own, own)]
-    left = gradient[own] - across.T @ (half.T @ gradient[~own])
-    lam, V = np.linalg.eigh(N[np.ix_(own, own)] - across.T @ across)
-    seen = lam > ROUND_OFF
-    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
+    return score(equations, own)
 
 
 def passive(p: Parameters) -> bool:

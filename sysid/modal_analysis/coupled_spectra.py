@@ -53,7 +53,7 @@ class CoupledLines(RecordModel):
         self._place(static, 0, gains=gains, coupled=True)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """None."""
+        """No traces: plain spectra have none."""
         return SpectralModel.trace_spectra(self, freq)
 
     def of_modes(self, modes: Modes, rigid: Array, coupling: Array | None) -> Parameters:

@@ -34,6 +34,10 @@ class Modes(NamedTuple):
         """Some of the modes, or all in another order, by flags or numbers."""
         return Modes(self.phi[:, which], self.gamma[which], self.omega[which], self.ratios[which])
 
+    def joined(self, others: Modes) -> Modes:
+        """These modes, and others behind them."""
+        return Modes(np.hstack([self.phi, others.phi]), *map(np.concatenate, zip(self[1:], others[1:], strict=True)))
+
 
 def modes_within(omega: Array, ends: Array, stated: Array, window: float = np.inf) -> NDArray[np.bool_]:
     """True for modes within lines from `ends[0]` to `ends[1]`, all where there is none; or the nearest to stated ones.

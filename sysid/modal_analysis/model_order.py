@@ -121,10 +121,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     else:
         gamma = np.sqrt(np.mean(p.modes.gamma**2, axis=0))
     phi, held = times**2 * rise / gamma, np.full(d, far)
-    modes = Modes(
-        np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, np.diag(gamma)]), np.append(p.modes.omega, held),
-        np.append(p.modes.ratios, np.full(d, ratio)),
-    )  # fmt: skip
+    modes = p.modes.joined(Modes(phi, np.diag(gamma), held, np.full(d, ratio)))
     first = p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
     monitor = monitor or FitMonitor()
     monitor.doing = "modes above the lines"
@@ -315,10 +312,7 @@ def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
         scale = np.sqrt(max(weighed, 1e-3 * float(np.linalg.norm(shape[n:]) / np.linalg.norm(gamma)), 1e-300))
         phi, gamma, push = phi / scale, gamma * scale, push * scale
     modes = p.modes
-    more = Modes(
-        np.column_stack([modes.phi, phi]), np.vstack([modes.gamma, gamma]), np.append(modes.omega, omega),
-        np.append(modes.ratios, ratio),
-    )  # fmt: skip
+    more = modes.joined(Modes(phi[:, None], gamma[None], np.atleast_1d(omega), np.atleast_1d(ratio)))
     return p.with_modes(more, np.vstack([p.ends, push[d:]]))
 
 

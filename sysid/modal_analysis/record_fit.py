@@ -32,6 +32,7 @@ from sysid.modal_analysis.record_model import (
 )
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
@@ -370,6 +371,21 @@ def half_inverse(normal: Array, least: float) -> Array:
     lam, V = np.linalg.eigh(normal)
     seen = lam > least * lam.max(initial=0.0)
     return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
+
+
+def score(equations: NormalEquations, added: NDArray[np.bool_]) -> tuple[float, int]:
+    """Fall of twice the sum of squares that `added` unknowns (p,) promise in one step, and how many of them show.
+
+    The score has half the normal matrix for its covariance (C. R. Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50-57).
+    """
+    N, size = unit_diagonal(equations.normal)
+    gradient = equations.gradient / size
+    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
+    across = half.T @ N[np.ix_(~added, added)]
+    left = gradient[added] - across.T @ (half.T @ gradient[~added])
+    lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
+    seen = lam > ROUND_OFF
+    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
 
 
 def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:

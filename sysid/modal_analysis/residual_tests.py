@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, score, unit_diagonal
 from sysid.modal_analysis.record_model import Parameters, Run
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
@@ -274,20 +274,11 @@ def _moving(fit: RecordFit, runs: tuple[int, ...]) -> tuple[RecordFit, Parameter
 def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
     model = fit.model_of(p)
-    equations = model.normal_equations(p, fit.levels)
-    N, size = unit_diagonal(equations.normal)
-    gradient = equations.gradient / size
     added = np.zeros(model.size, bool)
     ends = np.zeros(p.ends.shape, bool)
     ends[:, np.all(p.ends == 0, axis=0)] = True
     added[model.kept : model.kept + model.n_ends] = ends.ravel()
-    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
-    across = half.T @ N[np.ix_(~added, added)]
-    left = gradient[added] - across.T @ (half.T @ gradient[~added])
-    lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
-    seen = lam > ROUND_OFF
-    # The score has half the normal matrix for its covariance.
-    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
+    return score(model.normal_equations(p, fit.levels), added)
 
 
 def gain_errors_of(fit: RecordFit) -> Gains:

@@ -385,11 +385,8 @@ class ModeFit:
         poles = np.append(best.modes.omega[first], omega), np.append(best.modes.ratios[first], ratio)
         residue = linear_residues(self.test, *poles)[0][-1:] * self.unit
         added = rank_one(residue, np.array([omega]), np.array([ratio]), np.linalg.norm(residue, 2, (1, 2)) ** 0.5)
-        modes = Modes(
-            np.insert(best.modes.phi, [before], added.phi, axis=1),
-            np.insert(best.modes.gamma, before, added.gamma / self.unit, axis=0),
-            np.insert(best.modes.omega, before, omega), np.insert(best.modes.ratios, before, ratio),
-        )  # fmt: skip
+        added = added._replace(gamma=added.gamma / self.unit)
+        modes = best.modes.at(slice(before)).joined(added).joined(best.modes.at(slice(before, None)))
         if self.test.force is not None:
             modes.gamma[before] *= np.sqrt(weigh(self.test, modes)[0][before])
         return modes

@@ -101,7 +101,7 @@ class ResidualTerms:
 
     @cached_property
     def _columns(self) -> list[list[Array]]:
-        """Columns of each record as rows of `as_rows`: of accelerations a channel each, of the force all together."""
+        """Columns of each record, real parts above imaginary ones: of accelerations by channel."""
         functions = self.functions.reshape(len(self.functions), -1)
         n, d = self.test.n_sensors, self.test.n_base
         weights = [weight / scale for weight, scale in weights_of_test(self.test, weighted=True)]
@@ -138,7 +138,7 @@ class ResidualTerms:
         return sum(int(basis.shape[1]) for basis in self._bases) if self.omega.size else 0
 
     def without(self, number: int, misfit: ComplexArray) -> ComplexArray:
-        """What the best residues leave of weighted misfits of a record, 0 of accelerations, 1 of the force.
+        """Weighted misfits of a record, 0 of accelerations, 1 of the force, less what the best residues explain.
 
         Misfits and answer are (channels, runs * n_freq, k), each of the k by itself.
         """

@@ -57,8 +57,14 @@ class StatedProblem:
             as_float("Problem: goal", self.goal, "a positive relative residual", above=0)
         choice("Problem: loss", self.loss, ("squares", "huber"))
         flag("Problem: residual_modes", self.residual_modes)
-        if self.loss == "huber" and self.misfit is not None:
-            raise InputError("Problem: loss='huber' is of records, and this problem fits a misfit of its own instead")
+        own = self.misfit is not None
+        refuse(
+            (
+                own and self.loss == "huber",
+                "Problem: loss='huber' is of records, and this problem fits a misfit of its own",
+            ),
+            (own and self.residual_modes, "Problem: residual_modes=True is of records, not of a misfit of one's own"),
+        )
         if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
             raise InputError("Problem: healing is a dictionary from variables to expressions: {m: 9 * m / ca.sum1(m)}")
         for name, model in zip(MATRICES, as_models(self.mass, self.stiffness, self.damping), strict=True):

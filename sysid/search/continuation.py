@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -139,11 +138,12 @@ def descend(
 ) -> LocalResult:
     """Fit every step, and at last the records."""
     monitor = session.reporter("local phase")
-    way = next(iter(deque(smooth_fits(problem, x, steps, session, monitor), maxlen=1)), None)
+    way = None
+    for way in smooth_fits(problem, x, steps, session, monitor):
+        x = way.x
     if way is not None and way.stopped is not None:
         return replace(way, curve=np.zeros(0))  # the records have none yet
-    at = x if way is None else way.x
-    return local.solve_or_read(problem, at, session, monitor=monitor, coordinates=coordinates)
+    return local.solve_or_read(problem, x, session, monitor=monitor, coordinates=coordinates)
 
 
 class _Run:

@@ -107,7 +107,7 @@ class Modal:
             (not formulation.stiffness.free and part.stop > part.start, "the stiffness has a form of its own"),
             (not formulation.stiffness.free or not (mass.free or mass.entries is not None), written),
             (not formulation.damping.free, "the damping has a form of its own"),
-            (formulation.residual_modes and not formulation.mass.free, "residual modes are asked for beside that mass"),
+            (formulation.residual_modes and not problem.answers_in_band, "with this mass it fits no residual modes"),
             (start is not None, "a start was given"),
         )
         return next((why for applies, why in reasons if applies), None)
@@ -187,10 +187,12 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     message += "; the time was over before every further fit was tried" * late
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
     notes = _left_out(problem, structure, count)
-    if structure.at_sensors:
+    # Ratios are no unknowns that tell dampers which couple modes.
+    if structure.at_sensors and (structure.modal_damping or problem.formulation.beside):
         structure, answer = _in_unknowns(problem, structure, answer, monitor, session)
     elif problem.formulation.mass.free:
-        notes += (search_note(f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}"),)
+        if not structure.at_sensors:
+            notes += (search_note(f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}"),)
     else:
         plain = problem.measurement.sample_rate is not None
         raise DoesNotApplyError(

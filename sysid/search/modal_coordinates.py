@@ -67,13 +67,13 @@ def _linear_starts(test: Measurement, ended: ModalFit, first: Modes, own: int) -
     for poles, residues, _ in fits:
         mine = poles.at(slice(own))
         new = rank_one(residues[:own], mine.omega, mine.ratios, np.linalg.norm(mine.phi, axis=0))
-        yield joined(new, first.at(slice(own, None)))
+        yield new.joined(first.at(slice(own, None)))
 
 
 def _free_residues(test: Measurement, modes: Modes, own: int) -> tuple[Array, float]:
     """Free residues at the poles of a structure's own modes and at each pole of the others; what they leave."""
     others = modes.at(slice(own, None))
-    poles = joined(modes.at(slice(own)), others.at(separate_poles(others)[0]))
+    poles = modes.at(slice(own)).joined(others.at(separate_poles(others)[0]))
     residues, left = linear_residues(test, poles.omega, poles.ratios)
     return residues, float(left)
 
@@ -92,12 +92,8 @@ def modes_of(structure: Structure) -> Modes:
 def all_modes_of(structure: Structure) -> Modes:
     """The modes of a structure, then the residual ones."""
     beyond = structure.residual
-    return joined(modes_of(structure), Modes(beyond.shapes, beyond.participation, beyond.omega, beyond.damping_ratios))
-
-
-def joined(modes: Modes, others: Modes) -> Modes:
-    """Modes, and others behind them."""
-    return Modes(np.hstack([modes.phi, others.phi]), *map(np.concatenate, zip(modes[1:], others[1:], strict=True)))
+    others = Modes(beyond.shapes, beyond.participation, beyond.omega, beyond.damping_ratios)
+    return modes_of(structure).joined(others)
 
 
 def frequencies(problem: Prepared, start: Array, z: NonlinearProgram, *, near: bool = True) -> tuple[ca.MX, Array]:

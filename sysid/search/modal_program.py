@@ -246,7 +246,7 @@ class ModalResidual:
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
 
     def derivatives(self, z: NonlinearProgram, curved: int) -> dict[str, ca.Function]:
-        """Gradient and Hessian by the unknowns of a program, in IPOPT's scale; so many rows of constraints bend."""
+        """Gradient and Hessian by the unknowns of a program; its first `curved` constraints are nonlinear."""
         return _derivatives(z, self, self.hessian, curved)
 
     def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
@@ -340,7 +340,7 @@ def hessian_of(model: SpectraModel) -> NumpyFunction:
 
 
 def _derivatives(
-    z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction, curved: int = 0
+    z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction, curved: int
 ) -> dict[str, ca.Function]:
     """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()

@@ -478,9 +478,10 @@ def test_ctrl_c_before_a_first_fit_is_no_result(recipe, monkeypatch, ctrl_c):
 
 def test_what_excludes_each_other_and_what_is_no_change_is_refused(recipe):
     for given, told in (
-        ({"changes": [WithoutRun(0)], "starts": 2}, "exclude starts"),
-        ({"strategy": "auto", "starts": 2}, "exclude starts"),
+        ({"changes": [WithoutRun(0)], "starts": 2}, "without starts"),
+        ({"strategy": "auto", "starts": 2}, "without starts"),
         ({"strategy": "fast"}, "strategy 'fast' is unknown"),
+        ({"strategy": "swarm", "draws": 2}, "draws need Recipe.start"),
         ({"changes": ["run 1"]}, "changes holds a str; give Band"),
         ({"changes": WithoutRun(1)}, "give a list of Band, WithoutRun"),
     ):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.jobs.changes import drawn_from
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.coupled_modes import passive
 from sysid.modal_analysis.coupled_spectra import CoupledLines
@@ -190,3 +191,14 @@ def test_exact_spectra_give_the_damping_matrix_to_round_off():
     result = sysid.identify(sysid.Problem(test), rng=0)
     assert result.determined
     np.testing.assert_allclose(result.structure.damping, truth.damping, atol=1e-8 * truth.damping.max())
+
+
+def test_draws_of_noise_are_about_the_damping_matrix_of_the_answer():
+    """Ratios as unknowns would stand for another structure, so that it tells none."""
+    test = sysid.simulate(building(8.0), np.geomspace(1.2, 14.0, 200), noise=0.005, force=True, rng=1)
+    answer = sysid.identify(sysid.Problem(test), rng=0)
+    assert answer.x is None and not answer.structure.modal_damping
+    found = sysid.identify(drawn_from(answer, np.random.SeedSequence(3)), rng=0)
+    assert found.residual == pytest.approx(answer.residual, rel=0.1)
+    off = (found.structure.damping - answer.structure.damping) / answer.uncertainty.damping
+    assert 0.1 < np.sqrt(np.mean(off**2)) < 2.5

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.jobs.changes import WithoutSensor
+from sysid.jobs.score import scored
 from sysid.modal_analysis.response import gains, weighted_error
 from sysid.problem.residual_terms import ResidualTerms
 
@@ -209,3 +211,23 @@ def test_poles_far_above_and_below_the_lines_are_left_to_the_chosen_ones():
 def test_a_switch_is_true_or_false():
     with pytest.raises(sysid.InputError):
         problem(measured(truth(ratios=True), force=False), ratios=True, residual_modes="yes")
+
+
+def test_a_misfit_of_the_users_own_has_no_residual_modes():
+    with pytest.raises(sysid.InputError, match="residual_modes"):
+        problem(
+            measured(truth(ratios=True), force=False), ratios=True,
+            misfit=lambda structure: ca.MX(1) * structure.frequencies[0],
+        )  # fmt: skip
+
+
+def test_criteria_count_the_residues_and_no_sensor_is_predicted_by_residues_of_its_own():
+    test = measured(truth(ratios=True), force=False)
+    with_them, without = (
+        sysid.identify(problem(test, ratios=True, residual_modes=given), strategy="continuation", rng=0)
+        for given in (True, False)
+    )
+    beyond = with_them.prepared.formulation.own_test.matrices.beyond.size
+    assert beyond >= 3 * 2
+    assert scored(with_them).parameters == scored(without).parameters + beyond
+    assert np.isnan(WithoutSensor(0).predicted(with_them.prepared, with_them))

@@ -72,7 +72,7 @@ def graph(test, structure):
         SpectraModel(test, weights, np.arange(first.omega.size)),
     )
     of_theta = hessian_of(model)
-    functions = _derivatives(z, error, of_theta)
+    functions = _derivatives(z, error, of_theta, 0)
 
     def derivatives(at):
         value, gradient = functions["grad_f"](at, [])
