@@ -234,7 +234,9 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
-    normals, coupling, coupled = _coupled(couplings, own, inflation, normals, unseen)
+    normals, coupling, coupled = _coupled(
+        couplings, own, inflation * np.sqrt(problem.modal[0].scattered or 1.0), normals, unseen
+    )
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     mine = modes.at(own)
     changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.measurement.spectra import FOLDED, lines_of_record, runs_of_records
 from sysid.structure.structure import Array
 
+_AT_REST = 1 / 16  # of the largest motion of a run: the base of a run with less counts as at rest
+
 
 def excited_band(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float
@@ -44,7 +46,12 @@ def excited_band(
     >>> bool(1.6 < low <= 2.01 and 9.99 <= high < 12)
     True
     """
-    bands = [_band_of(run.base, sample_rate) for run in runs_of_records(runs, sample_rate)]
+    bases = [run.base for run in runs_of_records(runs, sample_rate)]
+    moved = [float(np.std(base, axis=1).max()) for base in bases]
+    # The noise of a run at rest is spread over all lines.
+    bands = [
+        _band_of(base, sample_rate) for base, rms in zip(bases, moved, strict=True) if rms >= _AT_REST * max(moved)
+    ]
     low, high = zip(*bands, strict=True)
     return min(low), max(high)
 

@@ -107,7 +107,8 @@ class PolesAndResidues:
         shift = share * float(np.exp(np.log(self.omega).mean()))
         ends = self.omega[[0, -1]] / (2 * np.pi)
         highest = min((1 + BEYOND) * ends[1], highest)
-        freq = np.linspace(max((1 - BEYOND) * ends[0], 1e-3 * ends[1]), highest, lines)
+        lowest = max((1 - BEYOND) * min(ends[0], highest), 1e-3 * ends[1])  # poles may all be above the lines
+        freq = np.linspace(lowest, highest, lines)
         base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
         relative, force = self.records(freq, base, shift)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
-from sysid.modal_analysis.modal_model import NormalEquations, Parameters
+from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
 from sysid.modal_analysis.model_order import least_worth
 from sysid.modal_analysis.record_fit import (
     ROUGH,
@@ -41,11 +41,31 @@ def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[
     return score(equations, own)
 
 
-def passive(p: Parameters) -> bool:
-    """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite."""
+def passive(p: Parameters, *, weighed: bool) -> bool:
+    """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite.
+
+    Where no force has `weighed` the modes their scales are open, and with them its symmetry: where no motion grows.
+    """
     assert p.coupling is not None
-    loss = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2
-    return bool(np.linalg.eigvalsh(loss)[0] >= 0)
+    omega, loss = p.modes.omega, np.diag(2 * p.modes.ratios * p.modes.omega) + p.coupling
+    if weighed:
+        return bool(np.linalg.eigvalsh((loss + loss.T) / 2)[0] >= 0)
+    state = np.block([[np.zeros_like(loss), np.eye(omega.size)], [-np.diag(omega**2), -loss]])
+    return bool(np.linalg.eigvals(state).real.max() <= ROUND_OFF * omega.max())
+
+
+def in_the_lines_alone(model: SpectralModel, p: Parameters, levels: Array, beyond: float) -> Parameters | None:
+    """Parameters without couplings of modes within the lines with those beyond; None where these matter.
+
+    An answer in the band has no place for them. `beyond` is the variance of a real number, in units of the levels.
+    """
+    assert p.coupling is not None
+    first, last = 2 * np.pi * model.test.freq[model.test.freq > 0][[0, -1]]
+    inside = (p.modes.omega >= first) & (p.modes.omega <= last)
+    across = (inside[:, None] != inside) & (p.coupling != 0)
+    plain = replace(p, coupling=np.where(across, 0.0, p.coupling))
+    rise = 2 * (model.trial_chi2(plain, levels) - model.trial_chi2(p, levels))
+    return plain if rise <= beyond * beyond_chance(np.count_nonzero(across) / 2) else None
 
 
 def with_couplings(
@@ -76,7 +96,10 @@ def with_couplings(
         more = fewer
     gained = 2 * (more.likelihood - fit.likelihood)
     least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
-    return more if more.settled and passive(more.parameters) and gained > beyond * least else fit
+    if not (more.settled and passive(more.parameters, weighed=more.model.force) and gained > beyond * least):
+        return fit
+    own = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
+    return fit if own is None else replace(more, parameters=own)
 
 
 def coupling_of(

@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.coupled_modes import coupling_of, passive, score_of_couplings
+from sysid.modal_analysis.coupled_modes import coupling_of, in_the_lines_alone, passive, score_of_couplings
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise
 from sysid.modal_analysis.misfit import Record
 from sysid.modal_analysis.modal_estimate import Coupling, ModalEstimate
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, separate_poles
 from sysid.modal_analysis.modal_model import Parameters, Run, SpectralModel
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import weights_of_test
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array, ComplexArray
@@ -100,8 +101,8 @@ def _information(model: CoupledLines, p: Parameters, scale: float = 1.0) -> tupl
     m, index = model.m, model.index
     found = coupling_of(model, p, normal, np.arange(m), np.arange(index.size))
     kept, own = slice(model.kept), model.coupling
-    follows = np.zeros((0, index.size)) if found is None else found.follows
-    return normal[kept, kept] + normal[kept, own] @ follows, found
+    of_kept = normal[kept, kept]
+    return of_kept if found is None else of_kept + normal[kept, own] @ found.follows, found
 
 
 def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max_iterations: int) -> ModalEstimate:
@@ -112,8 +113,8 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     test, fit = modal.records, modal.fit
     if fit is None or fit.weights is None or fit.weights.force is None or fit.of_accelerations <= EXACT:
         return modal
-    m, shared = fit.modes.omega.size, fit.modes.omega.size - separate_poles(fit.modes)[0].size
-    if m - fit.static < 2 or shared > max(fit.static - 1, 0):  # turns of modes at one pole are none that show
+    m, same = fit.modes.omega.size, fit.modes.omega.size - separate_poles(fit.modes)[0].size
+    if m - fit.static < 2 or same > max(fit.static - 1, 0):  # turns of modes at one pole are none that show
         return modal
     weights = _by_weights(test, fit.weights)
     model, asked = (CoupledLines(test, m, weights, static=fit.static, gains=gains) for gains in (False, True))
@@ -122,7 +123,8 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     numbers = 2 * (test.response.size + test.base.size)
     freedom, count = numbers - model.unknowns, len(model.coupled)
     promised, seen = score_of_couplings(asked, here)
-    if freedom <= 0 or promised < 2 * here.chi2 / freedom * beyond_chance(seen):
+    shared = _shared_by_lines(test, fit.modes)
+    if freedom <= 0 or promised < shared * 2 * here.chi2 / freedom * beyond_chance(seen):
         return modal
 
     def tell(_: int, p: Parameters, chi2: float) -> bool:
@@ -133,10 +135,23 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
         lambda p: model.normal_equations(p, model.levels),
     )  # fmt: skip
     p, chi2, settled = minimise(problem, tell, max_iterations, lambda chi2: EXACT * (chi2 + EXACT**2))
-    variance = max(2 * chi2 / freedom, EXACT**4)
-    if not settled or not passive(p) or 2 * (here.chi2 - chi2) < variance * beyond_chance(count):
+    variance = max(shared * 2 * chi2 / freedom, EXACT**4)
+    last, own = 2 * np.pi * test.freq[-1], slice(0, m - fit.static)
+    stays = np.count_nonzero(p.modes.omega <= last) == np.count_nonzero(fit.modes.omega <= last)
+    stays &= not fit.static or bool(np.all(p.modes.omega[own] < p.modes.omega[-1]))
+    enough = 2 * (here.chi2 - chi2) >= variance * beyond_chance(count)
+    if not (settled and stays and enough and passive(p, weighed=True)):
         return modal
-    return _estimate(modal, model, p, chi2, variance)
+    alone = in_the_lines_alone(model, p, model.levels, variance)
+    return modal if alone is None else _estimate(modal, model, alone, chi2, variance)
+
+
+def _shared_by_lines(test: Measurement, modes: Modes) -> float:
+    """Factor by which errors weigh more on smooth functions, as neighbouring lines share them."""
+    records, first = Records(test), separate_poles(modes)[0]
+    free = records.fit(modes.omega[first], modes.ratios[first], velocity=True)
+    unknowns = free.residues.size
+    return records.noise(free.left, unknowns) / records.variance(float(np.sum(free.left**2)), unknowns)
 
 
 def _estimate(modal: ModalEstimate, model: CoupledLines, p: Parameters, chi2: float, variance: float) -> ModalEstimate:

@@ -173,7 +173,8 @@ def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
 def least_worth(model: RecordModel) -> float:
     """Least fall of ``e' S^-1 e`` by a mode: more than noise makes of a residue of rank one and a pole, anywhere."""
     inputs = model.d + 2 * len(model.moving)
-    return beyond_chance(model.channels + inputs + 1, len(_RATIOS) * model.numbers) / 2
+    couplings = 2 * len(model.coupled) // max(model.m, 1)  # of one mode with the others
+    return beyond_chance(model.channels + inputs + 1 + couplings, len(_RATIOS) * model.numbers) / 2
 
 
 class Peak(NamedTuple):

@@ -362,14 +362,18 @@ class ModeFit:
             modes = self._with_mode(best, *self._most_above(omega, ratios))
             more = short._from(modes, best.rigid, best.static, together=False)
             stays = (np.count_nonzero(_poles_of(more)[0] <= last) == inside) & np.all(more.modes.omega < far)
-            if (
-                more.status != "settled"
-                or not stays
-                or best.residual**2 - more.residual**2 < least * self._variance(more)
-            ):
+            if more.status != "settled" or not stays:
+                break
+            if self._left(best, more) - more.residual**2 < least * self._variance(more):
                 break
             best = more
         return best
+
+    def _left(self, fit: ModalFit, other: ModalFit) -> float:
+        """Weighted squared error of a fit by the weights of another."""
+        assert other.weights is not None
+        model = SpectraModel(self.test, other.weights, separate_poles(fit.modes)[1])
+        return model.chi2(model.with_best_shapes(fit.modes, fit.rigid), model.levels)
 
     def _most_above(self, omega: Array, ratios: Array) -> tuple[float, float]:
         """The pole above the lines, below the static modes', that explains most beside others: rad/s and ratio."""

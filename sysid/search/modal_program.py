@@ -155,9 +155,9 @@ def _rigid_mass(
     IPOPT follows a curved valley, along which one part takes from the other.
     """
     d, scale = unit.size, np.outer(unit, unit)
-    root = triangle_entries(_root(remainder / scale, every_rank=every_rank))
-    free = np.where((root == 0) & (not every_rank), 0.0, np.inf)
-    factor = lower_triangle(z.variable("base mass", root, -free, free), d)
+    root = _root(remainder / scale, every_rank=every_rank)
+    free = np.where(np.any(root != 0, axis=0)[np.tril_indices(d)[1]], np.inf, 0.0)  # its columns
+    factor = lower_triangle(z.variable("base mass", triangle_entries(root), -free, free), d)
     entries = z.variable("rigid-body mass", triangle_entries((of_modes + remainder) / scale))
     in_parts = gamma.T @ gamma / ca.DM(scale) + factor @ factor.T
     z.constrain(entries - lower_entries(in_parts))

@@ -132,3 +132,12 @@ def test_a_base_at_rest_and_no_records_are_no_accident():
     for runs in ([], [(still[:, :1], still[:, :1], None)], [(still, still[:, 1:], None)]):
         with pytest.raises(sysid.InputError):
             sysid.excited_band(runs, RATE)
+
+
+def test_a_run_in_which_the_base_rests_widens_nothing():
+    moved, rest = random(between(1.0, 4.0)) + noise(0.01), noise(0.01, 7)
+    alone, both = (
+        sysid.excited_band([(base, base, None) for base in bases], RATE) for bases in ([moved], [moved, rest])
+    )
+    assert both == alone
+    assert both[0] > 0.5 and both[1] < 8

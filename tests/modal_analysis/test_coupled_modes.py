@@ -165,7 +165,8 @@ def test_couplings_of_some_modes_have_the_errors_of_all():
 def test_damping_that_feeds_energy_in_is_not_passive():
     modes, Z = modes_of(building())
     parameters = lambda factor: Parameters(modes, np.eye(1), np.zeros((3, 0)), np.zeros((1, 4, 0)), factor * Z)  # noqa: E731
-    assert passive(parameters(1.0)) and not passive(parameters(20.0))
+    for weighed in (True, False):
+        assert passive(parameters(1.0), weighed=weighed) and not passive(parameters(20.0), weighed=weighed)
 
 
 @pytest.mark.parametrize("records", [False, True])
@@ -202,3 +203,24 @@ def test_draws_of_noise_are_about_the_damping_matrix_of_the_answer():
     assert found.residual == pytest.approx(answer.residual, rel=0.1)
     off = (found.structure.damping - answer.structure.damping) / answer.uncertainty.damping
     assert 0.1 < np.sqrt(np.mean(off**2)) < 2.5
+
+
+@pytest.mark.parametrize("dashpot", [0.0, 25.0])
+def test_couplings_with_modes_beyond_the_lines_accuse_no_sign(dashpot):
+    """An answer in the band has no place for them: it keeps modal damping, which is then told to be too simple."""
+    truth = building(dashpot)
+    f = truth.natural_frequencies
+    test = sysid.simulate(truth, np.geomspace(1.2, (f[1] + f[2]) / 2, 200), noise=0.003, force=True, rng=2)
+    result = sysid.identify(sysid.Problem(test), rng=0)
+    assert result.structure.n == 2
+    told = {one.kind for one in result.contradictions}
+    assert told <= {"damping", "beyond noise"} and ("damping" in told) == (dashpot > 0)
+    assert result.structure.modal_damping
+
+
+def test_without_a_force_the_scale_of_modes_makes_no_damper_active():
+    modes, Z = modes_of(building())
+    scales = np.array([1.0, 8.0, 0.2])
+    turned = Z * scales[:, None] / scales
+    given = Parameters(modes, np.eye(1), np.zeros((3, 0)), np.zeros((1, 4, 0)), turned)
+    assert passive(given, weighed=False) and not passive(given, weighed=True)

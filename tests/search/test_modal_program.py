@@ -306,6 +306,20 @@ def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, s
     assert remainder[-1] < 0.02
 
 
+def test_base_mass_between_axes_is_found_from_a_start_without_it(random_structure):
+    rng = np.random.default_rng(5)
+    structure = random_structure(rng, n=4, d=2, base_mass=2.0)
+    test, truth = trial(rng, structure, force=True, lines=100), modes_of(structure)
+    remainder = structure.rigid_body_mass - truth.gamma.T @ truth.gamma
+    shifted = np.diag(np.diag(remainder))  # no record says so
+    end = solve_modes(
+        ModalEstimate.of_lines(test), truth, relative_spectrum(truth.omega, truth.ratios), unit=np.ones(2),
+        remainder=shifted, monitor=IterationMonitor(None, None),
+    )  # fmt: skip
+    np.testing.assert_allclose(end.rigid, structure.rigid_body_mass, rtol=1e-6, atol=1e-6 * np.trace(end.rigid))
+    assert np.abs(remainder[0, 1]) > 1e-3 * np.trace(remainder)
+
+
 @pytest.mark.parametrize("d", [1, 3])
 def test_a_start_without_base_mass_ends_where_one_with_all_of_it_does(random_structure, d):
     """The remainder keeps the rank that it starts with only while no more of it would leave less of the force."""
