@@ -105,16 +105,8 @@ BENCHMARKS = (
         "45 s",
         timed=True,
     ),
-    Benchmark(
-        "jobs.killed_searches",
-        "searches killed at random times and resumed: the same bits",
-        "8 min",
-        "25 s",
-        timed=True,
-    ),
-    Benchmark(
-        "jobs.interrupted_runs", "Ctrl-C at random times of a run: what is said and kept", "5 min", "20 s", timed=True
-    ),
+    Benchmark("jobs.killed_searches", "searches killed at random times and resumed: the same bits", "8 min", "25 s"),
+    Benchmark("jobs.interrupted_runs", "Ctrl-C at random times of a run: what is said and kept", "5 min", "20 s"),
     Benchmark(
         "jobs.lost_workers",
         "jobs whose workers are killed; what a job costs; gain of two",
@@ -124,13 +116,7 @@ BENCHMARKS = (
     ),
     Benchmark("jobs.two_workers", "eight draws of the tower by two workers, over one", "60 s", "25 s", timed=True),
     Benchmark("jobs.cut_link", "jobs on two machines whose link drops for 30 s", "2 min", "-", timed=True),
-    Benchmark(
-        "jobs.one_folder",
-        "two runs in one folder: one result, the other refused, none lost",
-        "15 min",
-        "30 s",
-        timed=True,
-    ),
+    Benchmark("jobs.one_folder", "two runs in one folder: one result, the other refused, none lost", "15 min", "30 s"),
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),
     Benchmark("hostile.hand_made_files", "files made by hand to have something run: nothing does", "60 s", "60 s"),
     Benchmark("hostile.fuzz", "every reader and the command line, given what chance makes", "50 min", "50 s"),
@@ -153,13 +139,7 @@ BENCHMARKS = (
         timed=True,
     ),
     Benchmark("records.measured_records", "measured records: stated deviations against a jackknife", "1 min", "30 s"),
-    Benchmark(
-        "records.stopped_fits",
-        "fits stopped by Ctrl-C and --max-time: nothing lost, in time",
-        "8 min",
-        "40 s",
-        timed=True,
-    ),
+    Benchmark("records.stopped_fits", "fits stopped by Ctrl-C and --max-time: nothing lost, in time", "8 min", "40 s"),
     Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "3 min", "10 s"),
     Benchmark(
         "files.read_files", "one test as CSV, MAT, UFF 58 and 58b: masses after read, run and export", "40 s", "12 s"
