@@ -41,17 +41,15 @@ def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[
     return score(equations, own)
 
 
-def passive(p: Parameters, *, weighed: bool) -> bool:
+def passive(p: Parameters) -> bool:
     """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite.
 
-    Where no force has `weighed` the modes their scales are open, and with them its symmetry: where no motion grows.
+    Where no force weighed the modes their scales are open, and this asks for more than has to be: late channels would
+    pass for couplings that need not be symmetric.
     """
     assert p.coupling is not None
-    omega, loss = p.modes.omega, np.diag(2 * p.modes.ratios * p.modes.omega) + p.coupling
-    if weighed:
-        return bool(np.linalg.eigvalsh((loss + loss.T) / 2)[0] >= 0)
-    state = np.block([[np.zeros_like(loss), np.eye(omega.size)], [-np.diag(omega**2), -loss]])
-    return bool(np.linalg.eigvals(state).real.max() <= ROUND_OFF * omega.max())
+    loss = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2
+    return bool(np.linalg.eigvalsh(loss)[0] >= 0)
 
 
 def in_the_lines_alone(model: SpectralModel, p: Parameters, levels: Array, beyond: float) -> Parameters | None:
@@ -96,7 +94,7 @@ def with_couplings(
         more = fewer
     gained = 2 * (more.likelihood - fit.likelihood)
     least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
-    if not (more.settled and passive(more.parameters, weighed=more.model.force) and gained > beyond * least):
+    if not (more.settled and passive(more.parameters) and gained > beyond * least):
         return fit
     own = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     return fit if own is None else replace(more, parameters=own)
