@@ -256,14 +256,17 @@ def test_spikes_hardly_change_the_figures_of_hubers_loss(result, stated):
     ("force", "total", "expected"),
     [
         (False, 500.0, 8 + 1),
-        # Each mode is weighed, and what no mode carries; the noises of force and accelerations share a scale.
-        (True, None, 10 + 1 + 1),
-        (True, 500.0, 10 + 1),
+        # Each mode is weighed, and what no mode carries; dampers couple the two modes; the noises of force and
+        # accelerations share a scale.
+        (True, None, 10 + 1 + 1 + 1),
+        (True, 500.0, 10 + 1 + 1),
     ],
 )
 def test_parameters_of_free_matrices_are_the_numbers_of_a_modal_model(force, total, expected):
     test = sysid.simulate(truth(), FREQ, noise=0.01, force=force, rng=0)
-    assert scored(sysid.identify(sysid.Problem(test, mass=sysid.FullMass(total)), rng=0)).parameters == expected
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass(total)), rng=0)
+    assert result.structure.modal_damping == (not force)
+    assert scored(result).parameters == expected
 
 
 def test_rayleigh_damping_counts_two_numbers_whatever_the_modes():
