@@ -123,8 +123,9 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     numbers = 2 * (test.response.size + test.base.size)
     freedom, count = numbers - model.unknowns, len(model.coupled)
     promised, seen = score_of_couplings(asked, here)
-    shared = _shared_by_lines(test, fit.modes)
-    if freedom <= 0 or promised < shared * 2 * here.chi2 / freedom * beyond_chance(seen):
+    least = 2 * here.chi2 / max(freedom, EXACT) * beyond_chance(seen)  # far more than there is without any freedom
+    # The factor is one or more, and takes a fit: it is asked for last.
+    if promised < least or promised < (shared := _shared_by_lines(test, fit.modes)) * least:
         return modal
 
     def tell(_: int, p: Parameters, chi2: float) -> bool:

@@ -24,6 +24,7 @@ import scipy
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_fit import STATIC_POLE, separate_poles
+from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
 from sysid.modal_analysis.spectra_modes import misses_static
@@ -95,11 +96,6 @@ class ResidualTerms:
         return self.omega.size == 0 or (alike and (self.test.force is None or self.test.n_base == 1))
 
     @cached_property
-    def _pairs(self) -> list[tuple[int, int]]:
-        """Entries of a symmetric matrix that are free."""
-        return list(zip(*np.tril_indices(self.test.n_base), strict=True))
-
-    @cached_property
     def _columns(self) -> list[list[Array]]:
         """Columns of each record, real parts above imaginary ones: of accelerations by channel."""
         functions = self.functions.reshape(len(self.functions), -1)
@@ -108,8 +104,9 @@ class ResidualTerms:
         found = [[_as_rows(functions[:, None] * weights[0][i]) for i in range(n)]]
         if self.test.force is not None:
             parts = functions.reshape(-1, d, functions.shape[1])
-            symmetric = np.zeros((len(parts), len(self._pairs), d, functions.shape[1]), dtype=complex)
-            for k, (i, j) in enumerate(self._pairs):
+            pairs = np.transpose(np.tril_indices(d))
+            symmetric = np.zeros((len(parts), len(pairs), d, functions.shape[1]), dtype=complex)
+            for k, (i, j) in enumerate(pairs):
                 symmetric[:, k, i], symmetric[:, k, j] = parts[:, j], parts[:, i]
             found.append([_as_rows(symmetric.reshape(-1, d, functions.shape[1]) * weights[1])])
         return found
@@ -240,17 +237,11 @@ def _as_rows(parts: ComplexArray) -> Array:
 
 def _range_of(group: Array) -> Array:
     """Orthonormal columns that span those of a group."""
-    U, s, _ = np.linalg.svd(group / _lengths(group), full_matrices=False)
+    U, s, _ = np.linalg.svd(unit_columns(group)[0], full_matrices=False)
     return U[:, s > round_off(s.size) * s[0]]
 
 
 def _solved(group: Array, left: Array) -> Array:
     """Coefficients of the columns of a group, by least squares; the shortest where they depend on each other."""
-    size = _lengths(group)
-    return np.asarray(np.linalg.lstsq(group / size, left, rcond=round_off(size.size))[0]) / size
-
-
-def _lengths(group: Array) -> Array:
-    """Lengths of columns; one for a column of zeros."""
-    size = np.linalg.norm(group, axis=0)
-    return np.where(size > 0, size, 1.0)
+    scaled, size = unit_columns(group)
+    return np.asarray(np.linalg.lstsq(scaled, left, rcond=round_off(size.size))[0]) / size
