@@ -1,4 +1,4 @@
-"""The main path: check the records, fit modes, choose a strategy, run it, judge what came out → `Identification`."""
+"""The main path: one clock, check the records, fit modes, choose a strategy, run it, judge → `Identification`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sysid.errors import InputError, SolverError, Stop, finite_array, instance, 
 from sysid.finding import Finding
 from sysid.modal_analysis.fit import fit_tests
 from sysid.nlp import one_thread
-from sysid.problem.prepared import Prepared
+from sysid.problem.prepared import Prepared, clocks_of
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
@@ -95,8 +95,9 @@ def identify(
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
-        prepared = Prepared(problem)
-        named = check_records(prepared)
+        clocks = clocks_of(problem)
+        prepared = Prepared(problem, delays=[clock.delays for clock in clocks])
+        named = check_records(prepared, clocks)
         with _telling_why(session, named):
             prepare(prepared, session)
         with _telling_why(session, named, prepared):
@@ -118,7 +119,7 @@ def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     try:
         with session.fit_monitor() as monitor:
-            problem.modal = fit_tests(problem.stated.tests, monitor)
+            problem.modal = fit_tests(zip(problem.stated.tests, problem.delays, strict=True), monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()
         problem.prepare(session.preparing)

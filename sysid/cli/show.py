@@ -32,7 +32,8 @@ from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
 from sysid.problem.direct_response import Slopes, slopes_of
-from sysid.problem.prepared import HELD, LOOSE, Prepared, points_of
+from sysid.problem.feasible import HELD
+from sysid.problem.prepared import LOOSE, Prepared, points_of
 from sysid.problem.problem import Problem
 from sysid.results.identification import load
 from sysid.results.storage import FILE_NAME

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, as_float, refuse, whole_number
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records, without_transients_of
@@ -253,8 +254,10 @@ def check_drawable(problem: StatedProblem) -> None:
 
 def _test_again(modal: ModalEstimate, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
     if modal.noise is None:
-        return _again(modal.records, structure, unknowns, rng)
-    return _whole_again(modal, modal.noise, structure, rng)
+        again = _again(modal.records, structure, unknowns, rng)
+    else:
+        again = _whole_again(modal, modal.noise, structure, rng)
+    return again if modal.delays is None else without_delays(again, -modal.delays.values)  # which each draw finds anew
 
 
 def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:

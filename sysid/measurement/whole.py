@@ -85,7 +85,8 @@ class WholeRecords:
     and two real numbers a mode, by which the motion at its end differs from that at its start; those stated to begin
     and end `at_rest` have no such numbers. Lines are multiples of ``sample_rate / N``, Hz. `noise` is stated, or None
     where it is estimated with the fit. `varying`, (runs, channels), are sensors, forces and base directions whose level
-    is found to vary over the lines; set by the fit, in no file.
+    is found to vary over the lines; `taken`, (n_sensors [+ 1],), s, are delays that were taken off sensors and force:
+    at one of its ends such a record holds what is not its own. Both are set by the fit, in no file.
     """
 
     samples: tuple[int, ...]
@@ -93,6 +94,7 @@ class WholeRecords:
     at_rest: tuple[bool, ...]
     noise: NoiseLevels | None = field(default=None)
     varying: NDArray[np.bool_] | None = field(default=None)
+    taken: Array | None = field(default=None)
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -119,7 +121,11 @@ class WholeRecords:
 
     def of_sensors(self, kept: NDArray[np.bool_]) -> WholeRecords:
         """That of some sensors."""
-        return replace(self, noise=self.noise and replace(self.noise, response=self.noise.response[..., kept]))
+        taken = self.taken
+        if taken is not None:
+            taken = np.concatenate([taken[: kept.size][kept], taken[kept.size :]])
+        noise = self.noise and replace(self.noise, response=self.noise.response[..., kept])
+        return replace(self, noise=noise, taken=taken)
 
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
@@ -128,6 +134,17 @@ class WholeRecords:
         """
         w = 2 * np.pi * freq
         return np.stack([1 / w**2, 1j / w])
+
+    def pulses(self, last: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Times from an end, s, (k,), at which turned records hold what is not theirs, two in a period of `last`, Hz.
+
+        And which sensors, and the force, do there, (n_sensors [+ 1], k). None where traces of sampling make up for it.
+        """
+        taken = np.zeros(0) if self.taken is None else self.taken
+        ends = np.array([taken.max(initial=0.0), taken.min(initial=0.0)])
+        late, early = (np.arange(np.ceil(2 * last * abs(end) - 0.25)) + 0.5 for end in ends)
+        times = np.concatenate([late, -early]) / (2 * last)
+        return times, (taken[:, None] * times > 0) & (np.abs(times) < np.abs(taken[:, None]) + 1 / (4 * last))
 
     def to_tree(self) -> dict[str, Any]:
         """Give it as dictionaries and arrays; `from_tree` takes it back."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -26,7 +27,7 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus, round_off
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
-_MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
+MOST_DAMPED = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
 _FEW = 0.25  # of the lines
 
@@ -65,8 +66,24 @@ class DirectTerms:
     misfit: float
 
 
-def direct_terms(test: Measurement) -> DirectTerms | None:
-    """Fit poles, residues and terms without poles; None where lines or base motion do not tell them.
+class BesidePoles(NamedTuple):
+    """Fits of a test's absolute accelerations on poles, free residues and terms that have no pole.
+
+    Attributes
+    ----------
+    test : Measurement
+        Its lines that are asked, without those with spikes.
+    every, at : AtPoles
+        Of all lines, and of these.
+    """
+
+    test: Measurement
+    every: AtPoles
+    at: AtPoles
+
+
+def beside_poles(test: Measurement) -> BesidePoles | None:
+    """Poles beside terms without any; None where lines or base motion do not tell them.
 
     Noise counts by its deviations where these are stated; a test of whole records is fitted with its transients.
     """
@@ -75,35 +92,46 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
             return None
         test = test.at(decimated_lines(test))
         test = replace(test, response_std=rough_deviations(test), force_std=None)
-    still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
-    with one_thread():
-        every = at = _relocated(still)
-        for _ in range(3):  # times that lines with spikes are left out
-            if at is None or not at.spikes.any():
-                break
-            still = still.at(~at.spikes)
-            at = _relocated(still)
-        if every is None or at is None:
-            return None
-        at = _settled(at)
-        rigid = _fitted(at, at.errors)
-        force = None if test.force is None else _fitted(_AtPoles(Records(still, force=True), at.poles), at.errors)
+    return beside_poles_at(test)
+
+
+@one_thread()
+def beside_poles_at(test: Measurement) -> BesidePoles | None:
+    """The same at these lines, with the deviations that they have."""
+    every = at = _relocated(test)
+    for _ in range(3):  # times that lines with spikes are left out
+        if at is None or not at.spikes.any():
+            break
+        test = test.at(~at.spikes)
+        at = _relocated(test)
+    return None if every is None or at is None else BesidePoles(test, every, at)
+
+
+@one_thread()
+def direct_terms(test: Measurement, beside: BesidePoles | None = None) -> DirectTerms | None:
+    """Terms without poles, at poles fitted beside them, from those found already; None where there are none."""
+    beside = beside or beside_poles(test)
+    if beside is None:
+        return None
+    test, at = beside.test, _settled(beside.at)
+    rigid = _fitted(at, at.errors)
+    force = None if test.force is None else _fitted(AtPoles(Records(test, force=True), at.poles), at.errors)
     (const, slope), (const_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, every.misfit
+        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, beside.every.misfit
     )
 
 
-def _relocated(still: Measurement, steps: int = 8) -> _AtPoles | None:
+def _relocated(test: Measurement, steps: int = 8) -> AtPoles | None:
     """Fit of the accelerations; None where the base moves in too few directions, or no pole is found.
 
     No pole is removed for explaining no more than noise. They are looked for in the principal channels, the first half
     of the steps in few of them, which is quicker; records without noise tell them in the first step.
     """
-    records = Records(still)
+    records = Records(replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None))
     start = _start(records)
-    if start is None or (not records.unit and records.driven < still.n_base):
+    if start is None or (not records.unit and records.driven < test.n_base):
         return None
     omega, ratios = start
     first, every = records.principal(4), records.principal(12)
@@ -117,7 +145,7 @@ def _relocated(still: Measurement, steps: int = 8) -> _AtPoles | None:
     return at
 
 
-def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
+def _settled(best: AtPoles, steps: int = 20, least: float = 1e-4) -> AtPoles:
     """The fit after Levenberg-Marquardt steps to likelier poles, until one would move no term by its deviation.
 
     Each channel has its own level of noise. No pole leaves the lines downwards, where modes show by their tail.
@@ -128,7 +156,7 @@ def _settled(best: _AtPoles, steps: int = 20, least: float = 1e-4) -> _AtPoles:
         if np.max(np.abs(moved)) < 1:
             break
         poles = best.poles + np.clip(step, -longest, longest)
-        trial = _AtPoles(best.records, np.clip(poles, *best.ends))
+        trial = AtPoles(best.records, np.clip(poles, *best.ends))
         better = np.sum(np.log(trial.level)) < np.sum(np.log(best.level))
         best, damping = (trial, max(damping / 10, least)) if better else (best, 10 * damping)
     return best
@@ -142,12 +170,12 @@ def _start(records: Records) -> tuple[Array, Array] | None:
     return (np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)) if count > 0 else None
 
 
-def _at(records: Records, omega: Array, ratios: Array) -> _AtPoles | None:
+def _at(records: Records, omega: Array, ratios: Array) -> AtPoles | None:
     """The fit on those poles that can be modes; None where there are none."""
     lines = records.lines
-    kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
+    kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < MOST_DAMPED)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
-    return _AtPoles(records, np.log([omega[kept], ratios[kept]]).ravel()) if np.any(kept) else None
+    return AtPoles(records, np.log([omega[kept], ratios[kept]]).ravel()) if np.any(kept) else None
 
 
 def _without_poles(freq: Array) -> ComplexArray:
@@ -156,7 +184,7 @@ def _without_poles(freq: Array) -> ComplexArray:
     return np.stack([np.ones_like(x) + 0j, 1j * x, x**2 + 0j])
 
 
-class _AtPoles:
+class AtPoles:
     """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on those without poles.
 
     Of the latter `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
@@ -188,7 +216,7 @@ class _AtPoles:
         """Least and largest log w_k and log zeta_k, (2m,) each."""
         least, most = np.full((2, *self.poles.shape), [[-np.inf], [np.inf]])
         least[: self.omega.size] = np.log(self.records.lines[0])
-        most[self.omega.size :] = np.log(_MODE)
+        most[self.omega.size :] = np.log(MOST_DAMPED)
         return least, most
 
     @property
@@ -258,7 +286,7 @@ class _Fit:
     below: bool
 
 
-def _fitted(at: _AtPoles, errors: Array) -> _Fit:
+def _fitted(at: AtPoles, errors: Array) -> _Fit:
     """The fit in the test's own units, the slopes per rad/s; `errors` (2m, r) of the poles are independent ones."""
     records = at.records
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
@@ -272,12 +300,12 @@ def _fitted(at: _AtPoles, errors: Array) -> _Fit:
     )
 
 
-def _shows_below(at: _AtPoles) -> bool:
+def _shows_below(at: AtPoles) -> bool:
     """True where modes below the lines leave what falls as 1/w², poles held at the first line left out."""
     inside = (at.poles > at.ends[0])[: at.omega.size]
     records = at.records
     if not inside.all() and inside.any():
-        at = _AtPoles(records, at.poles.reshape(2, -1)[:, inside].ravel())
+        at = AtPoles(records, at.poles.reshape(2, -1)[:, inside].ravel())
     tail = records.basis(np.maximum(2 * np.pi * records.freq, records.lines[0])[None] ** -2.0 + 0j, records.driven)
     beyond = np.linalg.qr(tail - at.basis.times(at.basis.answers(tail)))[0]
     gained, left = float(np.sum((beyond.T @ at.left) ** 2)), at.left

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
@@ -24,11 +26,14 @@ from sysid.modal_analysis.record_fit import (
     at_all_lines,
     joint_worth,
     on_all_lines,
+    on_turned,
     record_modes,
     refitted,
     without,
 )
 from sysid.modal_analysis.residual_tests import (
+    delays_left,
+    delays_of,
     excess_of,
     gain_errors_of,
     runs_in_motion,
@@ -43,10 +48,11 @@ from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 
 
-def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
+def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMonitor | None = None) -> RecordFit:
     """Modes, transients and noise of whole records, its levels smooth over the lines where they are no constants.
 
-    Where the monitor stops it, the best fit until then, with `stopped` set.
+    Delays that were found already, s, are taken off sensors and force, and what the fit finds left of them. Where the
+    monitor stops it, the best fit until then, with `stopped` set.
 
     Raises
     ------
@@ -55,16 +61,19 @@ def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> Record
     Stop, KeyboardInterrupt
         Where the monitor stops it before there was a fit.
     """
+    delays = np.zeros(test.n_sensors + (test.force is not None)) if delays is None else delays
     if monitor is None:
-        return _whole_fit(test, FitMonitor())
+        return _on_one_clock(test, delays, FitMonitor())
     try:
         with monitor.at_work():
-            return _whole_fit(test, monitor)
+            return _on_one_clock(test, delays, monitor)
     except (Stop, KeyboardInterrupt):
         best = monitor.best
         if not isinstance(best, RecordFit):
             raise
     _refuse_sines(best, test)
+    if best.model.whole.taken is not None:
+        test = without_delays(test, best.model.whole.taken)
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
 
@@ -74,6 +83,26 @@ def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
     sentence, modes = steady_sine(test), fit.parameters.modes
     if sentence is not None and (not fit.settled or at_sines_alone(test, modes.omega, modes.ratios)):
         raise InputError(sentence)
+
+
+def _on_one_clock(test: Measurement, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
+    """The fit without the delays that it finds itself; modes are looked for anew where these are of other channels."""
+    fit = _whole_fit(without_delays(test, delays), monitor)
+    for _ in range(rounds):
+        left = delays_left(fit)
+        if left is None:
+            break
+        monitor.doing, total = "delays", delays + left.values
+        turned = without_delays(test, total)
+        if np.any((total != 0) & (delays == 0)):
+            trial = _whole_fit(turned, monitor)
+        else:
+            trial = on_turned(fit, turned, monitor=monitor)
+        price = np.count_nonzero(total) - np.count_nonzero(delays)
+        if trial.schwarz - fit.schwarz < price * np.log(fit.model.numbers) / 2:
+            break
+        fit, delays = trial, total
+    return fit
 
 
 def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
@@ -191,12 +220,14 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
     return out
 
 
-def fit_modes(test: Measurement, *, monitor: FitMonitor | None = None) -> ModalEstimate:
+def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMonitor | None = None) -> ModalEstimate:
     """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
     ----------
     test : Measurement
+    delays : Delays, optional
+        Of its sensors and force, which are taken off: see `find_delays`.
     monitor : FitMonitor, optional
 
     Raises
@@ -204,14 +235,15 @@ def fit_modes(test: Measurement, *, monitor: FitMonitor | None = None) -> ModalE
     InputError, Stop, KeyboardInterrupt
         As `whole_fit` does.
     """
+    delays = delays or Delays.none(test)
     if test.whole is None:
-        return ModalEstimate.of_lines(test)
+        return replace(ModalEstimate.of_lines(without_delays(test, delays.values)), delays=delays)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        return estimate(whole_fit(test, monitor=monitor))
+        return estimate(whole_fit(test, delays.values, monitor=monitor))
 
 
-def fit_tests(tests: Iterable[Measurement], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
-    """The modes of each test, which share the time of the monitor.
+def fit_tests(tests: Iterable[tuple[Measurement, Delays]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
+    """The modes of each test without its delays; they share the time of the monitor.
 
     Raises
     ------
@@ -219,10 +251,10 @@ def fit_tests(tests: Iterable[Measurement], monitor: FitMonitor) -> tuple[ModalE
         As `whole_fit` does; the last two name the test, where there are several.
     """
     every, found = tuple(tests), []
-    for number, test in enumerate(every, start=1):
-        monitor.begin(sum(one.whole is not None for one in every[number - 1 :]))
+    for number, (test, delays) in enumerate(every, start=1):
+        monitor.begin(sum(one.whole is not None for one, _ in every[number - 1 :]))
         try:
-            found.append(fit_modes(test, monitor=monitor))
+            found.append(fit_modes(test, delays, monitor=monitor))
         except (Stop, KeyboardInterrupt) as stop:
             if len(every) == 1:
                 raise
@@ -266,5 +298,6 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
+        delays=delays_of(fit),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import columns, coupled_flexibility, gains, weights_of
@@ -97,7 +98,7 @@ class ModalEstimate:
     Attributes
     ----------
     given : Measurement
-        The test as it was given.
+        The test as it was given, without its delays.
     records : Measurement
         What is fitted: whole records as they would be at rest at both ends, their noise stated; others as given.
     phi : (n_sensors, m)
@@ -142,6 +143,8 @@ class ModalEstimate:
         Of whole records, of which all else can be made again.
     coupling : Coupling or None
         Of modes that dampers couple, where a force was measured; None where the damping is classical.
+    delays : Delays or None
+        Taken off sensors and force; None where none were asked for.
     """
 
     given: Measurement
@@ -167,6 +170,7 @@ class ModalEstimate:
     lacking: str = ""
     record_fit: RecordFit | None = None
     coupling: Coupling | None = None
+    delays: Delays | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:

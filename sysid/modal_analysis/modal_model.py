@@ -63,6 +63,10 @@ class NormalEquations(NamedTuple):
     gradient: Array
     chi2: float
 
+    def at(self, unknowns: Any) -> NormalEquations:
+        """Those of some of the unknowns, the others held."""
+        return self._replace(normal=self.normal[unknowns][:, unknowns], gradient=self.gradient[unknowns])
+
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
@@ -170,11 +174,27 @@ class Lines:
         self.transients = np.zeros((0, run.w.size), complex) if at is None else model.transients(freq)
         self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
         self.trace_spectra = model.trace_spectra(freq)
-        self.motion = self.answer(real_times(modes.gamma, run.base) + self.pushed_by_ends)
-        predicted = real_times(self.shapes, self.motion) + real_times(self.direct, run.base)
+        self.motion = self.motion_of(run.base)
+        self.error = run.outputs - self.predicted(run.base, self.motion)
+
+    def motion_of(self, base: ComplexArray) -> ComplexArray:
+        """Motions of the modes that this of the base makes, (m, L)."""
+        return self.answer(real_times(self.p.modes.gamma, base) + self.pushed_by_ends)
+
+    def predicted(self, base: ComplexArray, motion: ComplexArray) -> ComplexArray:
+        """Outputs of these motions of base and modes, with their traces, (c, L)."""
+        predicted = real_times(self.shapes, motion) + real_times(self.direct, base)
         if len(self.trace_spectra):
-            predicted += real_times(p.traces[run.number], self.trace_spectra)
-        self.error = run.outputs - predicted
+            predicted += real_times(self.p.traces[self.run.number], self.trace_spectra)
+        return predicted
+
+    def beside_the_fit(self, base: ComplexArray) -> ComplexArray:
+        """Spectra of what is only asked for: motion by modes above the lines, and what a delay makes of each output."""
+        freq = self.run.w / (2 * np.pi)
+        above = modes_above(freq, self.model.test.freq[-1])[:, None] * base
+        return np.concatenate([
+            *above, -1j * self.run.w * self.predicted(base, self.motion_of(base)),
+        ])  # fmt: skip
 
     @cached_property
     def flexibility(self) -> ComplexArray:
@@ -247,7 +267,7 @@ class Lines:
             parts.append((g[:, None] * self.transients).reshape(-1, base.shape[1]))
         parts.append(self.trace_spectra)
         if self.model.gains:
-            parts += list(modes_above(freq, self.model.test.freq[-1])[:, None] * base)
+            parts.append(self.beside_the_fit(base))
         return np.concatenate(parts)
 
 

@@ -23,12 +23,12 @@ from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.noise_levels import floors, likeliest_levels
 from sysid.modal_analysis.record_model import (
-    TRACES,
     HeldShapes,
     NormalEquations,
     Parameters,
     RecordModel,
     extra_numbers,
+    trace_count,
 )
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
@@ -56,7 +56,7 @@ class RecordFit:
     Attributes
     ----------
     test : Measurement
-        As given.
+        As given, on the clock of the base.
     parameters : Parameters
     levels : (pieces, c + d)
         Variances of a sample in time, of responses, forces and base; a row a run, or a stretch of a run's lines.
@@ -92,10 +92,14 @@ class RecordFit:
         return RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled)
 
     @cached_property
+    def asked(self) -> RecordModel:
+        """The same with the columns of gains and delays, which come last."""
+        return self.model_of(self.parameters, gains=True)
+
+    @cached_property
     def equations(self) -> NormalEquations:
-        """Normal equations at the end of the fit, with the columns of gains, which come last."""
-        model = self.model_of(self.parameters, gains=True)
-        return model.normal_equations(self.parameters, self.levels)
+        """Normal equations at the end of the fit, of the model that is `asked`."""
+        return self.asked.normal_equations(self.parameters, self.levels)
 
     @property
     def normal(self) -> Array:
@@ -170,7 +174,7 @@ class RecordFit:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any], test: Measurement) -> RecordFit:
-        """Give the fit of a test that `to_tree` made a tree of, exact to the bit.
+        """Give the fit of a test, without its delays, that `to_tree` made a tree of, exact to the bit.
 
         Raises
         ------
@@ -186,7 +190,7 @@ class RecordFit:
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
         shapes: list[tuple[int, ...]] = [
             (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
-            (test.n_runs, c, TRACES), (len(model.runs), c + model.d),
+            (test.n_runs, c, trace_count(test)), (len(model.runs), c + model.d),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
@@ -237,7 +241,7 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
     Poles that leave the records unexplained are not looked for far away: a few steps are taken.
     """
     m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
-    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, TRACES)))
+    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, trace_count(test))))
     model = HeldShapes(test, m, poles=held, static=fit.static, coupled=first.coupling is not None)
     return _fit(model, first, None, FitMonitor(), _POLES)
 
@@ -245,6 +249,15 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
     """The fit of a test from that of some of its lines."""
     return refitted(replace(fit, test=test), fit.parameters, some=fit.test, monitor=monitor)
+
+
+def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
+    """The fit of the same records with other delays taken off."""
+    assert test.whole is not None
+    test = replace(test, whole=replace(test.whole, varying=fit.model.whole.varying))
+    p, more = fit.parameters, trace_count(test) - fit.parameters.traces.shape[2]
+    traces = np.pad(p.traces, ((0, 0), (0, 0), (0, max(more, 0))))[:, :, : trace_count(test)]
+    return refitted(replace(fit, test=test), replace(p, traces=traces), monitor=monitor)
 
 
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
@@ -406,7 +419,7 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
         modes = modes._replace(phi=modes.phi / scale, gamma=modes.gamma * scale[:, None])
         ends = ends * scale[:, None]
     channels = test.n_sensors + (0 if test.force is None else d)
-    return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, TRACES)))
+    return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, trace_count(test))))
 
 
 def _rough_levels(model: RecordModel, p: Parameters) -> Array:

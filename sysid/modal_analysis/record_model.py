@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
-from sysid.modal_analysis.response import modes_above, real_times
+from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 
-TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w)
+_TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
 KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
 
 
@@ -83,11 +83,11 @@ class Sums(NamedTuple):
 class RecordModel(SpectralModel):
     """The model of a test of whole records with m modes.
 
-    The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
-    the rigid-body mass is left out.
+    The unknowns are those of `Index`, without a force but for its mass, then ``ends`` and ``traces``, in their order.
 
     With `gains` there are further columns, to be asked of at an end, (n_sensors, d) of each kind: a constant share of
-    the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what `modes_above` the lines make.
+    the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what `modes_above` the lines make;
+    then a delay of each sensor and of the force.
 
     The last `static` modes share a pole that is held, and do not move at the ends of runs. Where the others are
     `coupled` by dampers, entries of ``Phi' C Phi`` off the diagonal are the last unknowns before those of gains: each
@@ -119,7 +119,13 @@ class RecordModel(SpectralModel):
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self._place(static, TRACES, gains=gains, coupled=coupled)
+        self.pulses, reached = self.whole.pulses(test.freq[-1])
+        self._place(static, trace_count(test), gains=gains, coupled=coupled)
+        if self.pulses.size:  # a run that begins and ends at rest has none
+            of_channels = np.append(reached, np.repeat(reached[self.n :], self.d - 1, axis=0), axis=0)
+            own = of_channels & np.isin(np.arange(test.n_runs), self.whole.moving)[:, None, None]
+            traces = np.concatenate([np.ones((*own.shape[:2], _TRACES), bool), own], axis=2)
+            self.held[self.kept + self.n_ends : self.coupling.start] = ~traces.ravel()
 
     def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
         """Set where the unknowns stand; `traces` is how many a channel and run has."""
@@ -130,7 +136,8 @@ class RecordModel(SpectralModel):
         self.coupling = slice(before, before + len(self.coupled))
         self.n_fit = self.coupling.stop
         self.gains = gains
-        self.size = self.n_fit + gains * 3 * self.n * self.d
+        self.delays = self.n_fit + 3 * self.n * self.d  # where they begin
+        self.size = self.delays + self.n + self.force if gains else self.n_fit
         self.static, self.held = static, np.zeros(self.size, bool)
         if static:
             ends = self.held[self.kept : self.kept + self.n_ends].reshape(m, -1)
@@ -143,9 +150,10 @@ class RecordModel(SpectralModel):
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """Spectra of which the traces of a channel are multiples, (TRACES, L)."""
+        """Spectra of which the traces of a channel are multiples, (traces, L): last those of turned records' ends."""
         unit = freq / self.test.freq[-1]
-        return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
+        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
+        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses[:, None] * freq)])
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
@@ -319,7 +327,7 @@ class Chunk(Lines):
             yield row, last + np.arange(2 * m), np.repeat(shapes, 2)
             last = last + 2 * m
         yield from self.of_sensor(channel, first[3], last)
-        beside = last + len(self.trace_spectra) + 2 * d * model.gains
+        beside = last + len(self.trace_spectra) + (2 * d + model.channels) * model.gains
         for side, mode in enumerate(model.coupled.T[: 1 + model.force]):
             pairs = np.arange(mode.size)
             yield model.coupling.start + pairs, beside + side * mode.size + pairs, shapes[mode]
@@ -348,11 +356,14 @@ class Chunk(Lines):
     def of_sensor(
         self, channel: int, base: int, last: int
     ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
-        """Entries of a channel's traces, whose spectra begin at `last`, and of a sensor's gain."""
+        """Entries of a channel's traces, whose spectra begin at `last`, of its delay, and of a sensor's gain."""
         model, n, d = self.records, self.records.n, self.records.d
         beside, traces = np.arange(d), np.arange(len(self.trace_spectra))
         first_trace = model.kept + model.n_ends + (self.run.number * model.channels + channel) * traces.size
         yield first_trace + traces, last + traces, np.ones(traces.size)
+        if model.gains:
+            late = last + traces.size + 2 * d + channel
+            yield np.array([model.delays + min(channel, n)]), np.array([late]), np.ones(1)
         if model.gains and channel < n:
             yield model.n_fit + channel * d + beside, base + beside, np.ones(d)
             for kind in (1, 2):
@@ -405,7 +416,7 @@ class CoupledChunk(Chunk):
             parts.append(w_a[:, :, None] * self.transients)
         parts.append(self.trace_spectra)
         if self.records.gains:
-            parts.append(modes_above(w / (2 * np.pi), self.records.test.freq[-1])[:, None] * base)
+            parts.append(self.beside_the_fit(base))
         return np.concatenate([part.reshape(-1, size) for part in parts])
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
@@ -429,6 +440,12 @@ class CoupledChunk(Chunk):
             spectra = start + np.arange(m * row.size)
             yield np.tile(row, m), spectra, np.repeat(shapes, row.size)
         yield from self.of_sensor(channel, int(first[4]), int(last))
+
+
+def trace_count(test: Measurement) -> int:
+    """Real numbers of each channel and run beside the response and its transients."""
+    assert test.whole is not None
+    return _TRACES + test.whole.pulses(test.freq[-1])[0].size
 
 
 def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.modal_analysis.delays import Delays, beyond_noise, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
@@ -287,7 +288,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
     better known of both is taken. Motion with the base in any of its directions is asked for beside that part.
     """
-    equations, G = fit.equations, fit.test.rigid_body
+    equations, G = fit.equations.at(slice(fit.asked.delays)), fit.test.rigid_body
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(2 * n * d))
@@ -319,7 +320,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
-    equations, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
+    equations, (n, d), at = fit.equations.at(slice(fit.asked.delays)), fit.test.rigid_body.shape, fit.model.size
     normal, size = unit_diagonal(equations.normal)
     half, asked = half_inverse(normal, ROUND_OFF), slice(at, at + n * d)
     step = (half @ (half.T @ (equations.gradient / size)))[asked].reshape(n, d)
@@ -327,3 +328,32 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)
     return step / size[asked].reshape(n, d), chi2
+
+
+def delays_left(fit: RecordFit) -> Delays | None:
+    """Delays of sensors and force that a step of all unknowns from the end of a fit finds beyond chance, or None."""
+    step, covariance = _delays(fit, np.eye(fit.asked.size - fit.asked.delays))
+    told = np.flatnonzero(np.diag(covariance))
+    found = beyond_noise(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
+    return found and found.at(told, step.size)
+
+
+def delays_of(fit: RecordFit) -> Delays:
+    """Delays that were taken off the records of a fit, with their errors at its end."""
+    taken = fit.model.whole.taken
+    if taken is None:
+        return Delays.none(fit.test)
+    of_base = taken.size > 1 and bool(np.all(taken == taken[0]))
+    late = np.ones((taken.size, 1)) if of_base else np.eye(taken.size)[:, taken != 0]
+    return Delays(taken, late @ np.sqrt(np.diag(_delays(fit, late)[1])), of_base)
+
+
+def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
+    """Step of delays along columns (k, q) of all of them, s, and its covariance; zero where nothing tells them."""
+    at, first = fit.model.size, fit.asked.delays
+    turn = np.zeros((fit.asked.size, at + along.shape[1]))
+    turn[:at, :at], turn[first:, at:] = np.eye(at), along
+    normal, size = unit_diagonal(turn.T @ fit.equations.normal @ turn)
+    half = half_inverse(normal, ROUND_OFF)
+    step, rows = half @ (half.T @ (turn.T @ fit.equations.gradient / size)), half[at:] / size[at:, None]
+    return step[at:] / size[at:], max(fit.reduced, 1.0) / 2 * rows @ rows.T

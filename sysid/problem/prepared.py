@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.delays import Clock, Delays, stored_delays
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -27,15 +29,22 @@ from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import Unknown
-from sysid.nlp import IterationMonitor, quiet_options
+from sysid.nlp import IterationMonitor
+from sysid.problem.feasible import HELD, check_constraints, scale_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, geometry_of, rough_mass
 from sysid.problem.stated import StatedProblem
 from sysid.structure.structure import Array, Structure
 from sysid.swarm import box
 
-HELD = 1e-6  # of a constraint's scale: what counts as satisfied
 LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
+
+
+def clocks_of(stated: StatedProblem) -> list[Clock]:
+    """Each test without its delays; the problem's own as it is where a misfit stands in its place."""
+    first, *further = stated.tests
+    own = Clock.of(first) if stated.misfit is None else Clock(first, Delays.none(first), None)
+    return [own, *map(Clock.of, further)]
 
 
 def points_of(formulation: Formulation) -> Array:
@@ -80,58 +89,6 @@ def _positive(matrix: Array) -> bool:
         return False
     size = np.sqrt(np.diag(matrix))
     return bool(scipy.linalg.eigvalsh(matrix / np.outer(size, size), subset_by_index=(0, 0))[0] > 1e-13)
-
-
-def scale_of(formulation: Formulation, points: Array) -> Array:
-    """Variation of each constraint over the search space, (rows,)."""
-    values = np.array([formulation.constraints.at(x) for x in points])
-    with np.errstate(invalid="ignore"):
-        spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0, initial=0.0)
-    return np.where(spread > 0, spread, 1.0)
-
-
-def check_constraints(formulation: Formulation, points: Array, site: str) -> None:
-    """Refuse constraints that no point satisfies."""
-    constraints = formulation.constraints
-    if not constraints.lower.size:
-        return
-    scale = scale_of(formulation, points)
-    broken = np.array([constraints.violation(x) for x in points]) / scale
-    order = np.argsort(np.sum(np.where(np.isfinite(broken), broken, np.inf) ** 2, axis=1))
-    best, at = np.full(scale.size, np.inf), np.inf
-    for x in points[order[:8]]:  # those that break them least
-        left = _nearest(formulation, x, scale)
-        if left.max(initial=0.0) < at:
-            best, at = left, left.max(initial=0.0)
-        if at <= HELD:
-            return
-    worst = dict.fromkeys(source for source, miss in zip(constraints.sources, best, strict=True) if miss > HELD)
-    raise InputError(
-        f"no point within the bounds satisfies {' and '.join(worst)} (problem at {site}): widen the bounds of these "
-        "variables, or correct the relation"
-    )
-
-
-def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
-    """Least violation that IPOPT finds from a point, relative to the scale, (rows,)."""
-    constraints, lower, upper = formulation.constraints, formulation.lower, formulation.upper
-    width = np.where(upper > lower, upper - lower, 1.0)
-    t = ca.MX.sym("t", formulation.size)
-    slack = ca.MX.sym("slack", scale.size)
-    g = constraints.function(ca.DM(lower) + ca.DM(width) * t) / ca.DM(scale)
-    solver = ca.nlpsol(
-        "feasible", "ipopt", {"x": ca.vertcat(t, slack), "f": ca.sumsqr(slack), "g": g - slack}, quiet_options(200)
-    )
-    first = (start - lower) / width
-    answer = solver(
-        x0=np.concatenate([first, np.zeros(scale.size)]), lbg=constraints.lower / scale, ubg=constraints.upper / scale,
-        lbx=np.concatenate([np.zeros(first.size), np.full(scale.size, -np.inf)]),
-        ubx=np.concatenate([np.where(upper > lower, 1.0, 0.0), np.full(scale.size, np.inf)]),
-    )  # fmt: skip
-    # Whatever the status, what counts is the violation at the point that came, put inside the box.
-    found = np.clip(np.asarray(answer["x"]).ravel()[: first.size], 0.0, 1.0)
-    broken = constraints.violation(lower + width * found) / scale
-    return np.where(np.isfinite(broken), broken, np.inf)
 
 
 Monitor = Callable[[int, float], object]
@@ -182,16 +139,18 @@ class Prepared(SearchSpace):
     """Statements of a user, and the modal estimate of each fitted test: what strategies search and checks judge.
 
     `modal` are the estimates of the tests, the problem's own first, found when first asked for where none are given;
-    `fits`, of whole records, are what they are then made of. With `in_squares` squares are fitted, whatever loss is
-    stated.
+    `delays` of the tests, and `fits` of whole records, are what they are then made of. With `in_squares` squares are
+    fitted, whatever loss is stated.
     """
 
     def __init__(
         self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False,
-        fits: Sequence[RecordFit | None] = (),
+        delays: Sequence[Delays] = (), fits: Sequence[RecordFit | None] = (),
     ) -> None:  # fmt: skip
         self.stated, self.in_squares = stated, in_squares or stated.loss == "squares"
         self._fits = tuple(fits) or (None,) * len(stated.tests)
+        if delays:
+            self.delays = tuple(delays)
         if modal:
             self.modal = tuple(modal)
 
@@ -219,16 +178,25 @@ class Prepared(SearchSpace):
     @classmethod
     def from_tree(cls, stated: StatedProblem, tree: dict[str, Any]) -> Prepared:
         """Make what `to_tree` made a tree of, with the fits of its whole records."""
-        tests = stated.tests
+        tests, delays = stated.tests, stored_delays(tree, stated.tests)
         fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
-        return cls(stated, fits=[fit and RecordFit.from_tree(fit, test) for fit, test in zip(fits, tests, strict=True)])
+        read = [
+            fit and RecordFit.from_tree(fit, without_delays(test, late.values))
+            for fit, test, late in zip(fits, tests, delays, strict=True)
+        ]
+        return cls(stated, delays=delays, fits=read)
+
+    @cached_property
+    def delays(self) -> tuple[Delays, ...]:
+        """Delays of each test's sensors and force, as they are found before its modes."""
+        return tuple(clock.delays for clock in clocks_of(self.stated))
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
         return tuple(
-            fit_modes(test) if fit is None else estimate(fit)
-            for test, fit in zip(self.stated.tests, self._fits, strict=True)
+            fit_modes(test, delays) if fit is None else estimate(fit)
+            for test, delays, fit in zip(self.stated.tests, self.delays, self._fits, strict=True)
         )
 
     def fit_lines(
@@ -495,4 +463,5 @@ class Prepared(SearchSpace):
         given = all(one.records is one.given for one in self.screened.modal)
         poles = self.geometry.found if given else None
         fits = [one.record_fit and one.record_fit.to_tree() for one in self.modal]
-        return {**self.stated.to_tree(), "poles": poles and asdict(poles), "fits": fits}
+        delays = [one.delays and one.delays.to_tree() for one in self.modal]
+        return {**self.stated.to_tree(), "poles": poles and asdict(poles), "fits": fits, "delays": delays}

@@ -121,6 +121,7 @@ class StatedProblem:
             "given": self.as_given,
             "poles": None,
             "fits": [],
+            "delays": [],
             "reference": self.reference and self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,

@@ -196,7 +196,7 @@ class Answer:
         if part is None:
             return self.prepared.modal
         fit = part.records.fit
-        return (fit_modes(part.records.measurement) if fit is None else estimate(fit),)
+        return (fit_modes(part.records.measurement, part.records.delays) if fit is None else estimate(fit),)
 
     @cached_property
     def fitted(self) -> ModalEstimate:

@@ -11,7 +11,9 @@ import numpy as np
 from sysid.assessment.checks.gains import taken_at_sensors
 from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.delays import Delays, stored_delays
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
@@ -163,6 +165,7 @@ class StoredRecords:
     validation: tuple[Measurement, ...]
     goal: float | None
     loss: str
+    delays: Delays
     fit: RecordFit | None
     """Of whole records, which the file holds."""
 
@@ -170,13 +173,15 @@ class StoredRecords:
     def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
         test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
+        (delays,) = stored_delays(tree, [test])
         return cls(
             test,
             None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
             tuple(Measurement.from_tree(test) for test in tree["validation"]),
             tree["goal"],
             tree["loss"],
-            None if fits[0] is None else RecordFit.from_tree(fits[0], test),
+            delays,
+            None if fits[0] is None else RecordFit.from_tree(fits[0], without_delays(test, delays.values)),
         )
 
 

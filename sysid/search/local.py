@@ -22,9 +22,10 @@ import numpy as np
 from sysid.models.expressions import lower_entries
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words, time_too_short
+from sysid.problem.feasible import HELD
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import HELD, LOOSE, Prepared
+from sysid.problem.prepared import LOOSE, Prepared
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
 from sysid.search.modal_coordinates import fit_in_modes, frequencies

@@ -9,7 +9,7 @@ from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.records.simulated import coupled
 from benchmarks.records.trial import measurement
 from sysid import Measurement, simulate
-from sysid.modal_analysis.direct_terms import _AtPoles, _fitted, direct_terms
+from sysid.modal_analysis.direct_terms import AtPoles, _fitted, direct_terms
 from sysid.modal_analysis.residues import Records
 from sysid.structure.thresholds import most_deviations
 
@@ -76,7 +76,7 @@ def test_deviations_are_those_of_least_squares_in_poles_and_coefficients_togethe
     noise = rng.standard_normal((len(X), channels)) * [0.1, 0.2, 0.3, 0.4]
     y = X @ residues + noise
     response = (y[: len(y) // 2] + 1j * y[len(y) // 2 :]).T.reshape(channels, 3, -1).swapaxes(0, 1)
-    at = _AtPoles(Records(Measurement(freq, base, response, rigid_body=np.zeros((channels, 2)))), poles)
+    at = AtPoles(Records(Measurement(freq, base, response, rigid_body=np.zeros((channels, 2)))), poles)
     found = _fitted(at, at.errors[:, :-1])  # noise alone
 
     best = np.linalg.lstsq(X, y)[0]

@@ -10,6 +10,7 @@ from sysid.assessment.checks import against_records, gains, mistakes, model_erro
 from sysid.assessment.checks.context import Check
 
 CHECKS: tuple[Check, ...] = (
+    mistakes.late_channels,
     mistakes.wrong_records,
     search_end.stopped,
     stated.keeping_bounds,
@@ -40,4 +41,4 @@ OF_THE_END: tuple[Check, ...] = (
     model_error.beyond_noise,
     search_end.no_solution,
 )  # whether a search ended at a fit
-QUICK: tuple[Check, ...] = (mistakes.wrong_records, *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])
+QUICK: tuple[Check, ...] = (*CHECKS[:2], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])

@@ -1,13 +1,13 @@
 """Mistakes in the records of a test, named by what they leave beside all modes, before anything is fitted to a model.
 
 What each sensor moves with the base beside its modes is its row of rigid_body, whatever mass and stiffness are (see
-`sysid.modal_analysis.direct_terms`). Records that differ from it by a sign, a unit, a gain, a delay, or because two
+`sysid.modal_analysis.direct_terms`). Records that differ from it by a sign, a unit, a gain, or because two
 sensors stand in each other's place, tell so. docs/mistakes.md has the table of what can be told, and what cannot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,23 +21,19 @@ from sysid.files.units import STANDARD_GRAVITY
 from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.delays import Clock, Delays
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.modal_analysis.rough_poles import poles_of_test
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
-from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import AS_GOOD, CANDIDATES, MENDED, most_deviations
+from sysid.structure.thresholds import CANDIDATES, MENDED, most_deviations
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
 _LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
 _NONE = 0.1  # of a sensor's rigid-body motion; as good as none, or not known where the standard deviation is larger
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
-_TURN = 0.03  # rad at the last line; the least delay that is told
-_LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
-_MOST = 1.5  # rad at the last line; the largest one
-_ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
 _UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
     (STANDARD_GRAVITY, "9.81", "g", "m/s²"),
     (1 / STANDARD_GRAVITY, "9.81", "g", "m/s²"),
@@ -50,10 +46,8 @@ _CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
 def is_gross(mistake: Finding) -> bool:
     """True where no model of a form of its own fits a channel with it: a search in its unknowns is not worth its time.
 
-    A gain of one sensor and a small delay may be fitted so far that the rest is of use.
+    A gain of one sensor may be fitted so far that the rest is of use.
     """
-    if mistake.kind == "late sensor":
-        return mistake.numbers["turn"] > _LARGE_TURN
     return mistake.kind not in ("gain", "short segments")
 
 
@@ -68,8 +62,7 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
         return list(_conjugated(test, terms))
     if terms.below:
         return []
-    late, terms = _late(test, terms)
-    return [*late, *_of_motion(test, terms), *_of_force(test, terms)]
+    return [*_of_motion(test, terms), *_of_force(test, terms)]
 
 
 def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -86,69 +79,6 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
             "take the complex conjugate of response and force (numpy.conj)",
             numbers={"misfit": terms.misfit, "conjugated": other.misfit},
         )  # fmt: skip
-
-
-def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectTerms]:
-    """Sensors whose records are late against the base's, and the terms of the records without that delay."""
-    total = np.zeros(test.n_sensors)
-    for _ in range(3):  # times that a delay is taken off
-        found = _delays(test, terms)
-        if found is None:
-            break
-        total += found
-        if test.is_whole:  # a record turned by its spectrum begins with its end
-            break
-        turn = np.exp(2j * np.pi * total[:, None] * test.freq)
-        mended = direct_terms(replace(test, response=test.response * turn))
-        if mended is None or mended.misfit > AS_GOOD * terms.misfit:
-            return [], terms
-        terms = mended
-    which = np.flatnonzero(total)
-    if not which.size:
-        return [], terms
-    of_all = which.size == np.count_nonzero(np.any(test.rigid_body, axis=1)) and which.size > 1
-    who = "the records of all sensors are" if of_all else f"the record of {_names(test, which)} is"
-    delay = float(np.mean(total[which]))
-    word = "late" if delay > 0 else "early"
-    turn = abs(delay) * 2 * np.pi * float(test.freq[-1])
-    late = Finding(
-        "late sensor", Severity.BLOCKING if of_all and turn > _LARGE_TURN else Severity.CONTRADICTS,
-        f"{who} {1e3 * abs(delay):.3g} ms {word} against the base's: beside their modes the sensors follow the base "
-        "with a phase that grows with frequency, as two clocks or a filter on some channels alone make it",
-        "bring them to one clock (sysid.resample), or filter all channels alike",
-        channel=test.sensor_names[which[0]] if which.size == 1 else None, numbers={"delay": delay, "turn": turn},
-    )  # fmt: skip
-    return [late], terms
-
-
-def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
-    """Delay of each sensor beyond chance, s, one for all or that of one alone; None where there is none."""
-    reach = _reach(test)
-    c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
-    size = np.sum(c**2, axis=1)
-    stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
-    precise = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
-    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & precise)
-    if not known.size:
-        return None
-    delay = -np.sum(slope * c, axis=1)[known] / size[known]
-    error = np.sqrt(np.sum((std * c) ** 2, axis=1))[known] / size[known]
-    error = np.maximum(error, np.finfo(float).tiny)
-    least = _TURN / (2 * np.pi * test.freq[-1])
-    mean = float(np.average(delay, weights=error**-2))
-    off = (np.abs(delay) > most_deviations(CANDIDATES) * error) & (np.abs(delay) > least)
-    if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
-        return None
-    out = np.zeros(test.n_sensors)
-    if np.all(np.abs(delay - mean) < np.maximum(most_deviations(CANDIDATES) * error, _ALIKE * abs(mean))):
-        if abs(mean) < max(most_deviations(CANDIDATES) / np.sqrt(np.sum(error**-2)), least):
-            return None
-        out[known] = mean
-    elif np.count_nonzero(off) == 1 and known.size > 2:
-        out[known[off]] = delay[off]
-    else:
-        return None
-    return out
 
 
 def _reach(test: Measurement) -> Array:
@@ -371,32 +301,58 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
 
 
 def wrong_records(context: Context) -> Iterator[Finding]:
-    """Records, or what is stated of them, are wrong by a sign, a unit, a delay, a swapped sensor."""
+    """Records, or what is stated of them, are wrong by a sign, a unit, a swapped sensor."""
     yield from context.named
 
 
-def check_records(prepared: Prepared) -> tuple[Finding, ...]:
+def late_channels(context: Context) -> Iterator[Finding]:
+    """Sensors or the force were recorded late against the base: their delays are found, and taken off."""
+    problem = context.problem
+    tests = problem.modal if problem.formulation.fits_records else problem.modal[1:]
+    yield from of_tests([list(_late(one.given, one.delays or Delays.none(one.given))) for one in tests])
+
+
+def _late(test: Measurement, delays: Delays) -> Iterator[Finding]:
+    """One finding of a base that is early, else one of each channel, the most certain first."""
+    names = [*test.sensor_names, "the base force"]
+    certain = np.argsort(-np.abs(delays.values) / np.where(delays.values != 0, delays.std, 1.0), kind="stable")
+    for channel in certain[: 1 if delays.of_base else np.count_nonzero(delays.values)]:
+        delay, std = float(delays.values[channel]), float(delays.std[channel])
+        who, whom, key = names[channel], "the base", f"delay = {delay:.3g} for this channel"
+        if delays.of_base:
+            who, whom, key = "the base", "all other channels", f"delay = {-delay:.3g} for the base"
+        word = "early" if (delay < 0) != delays.of_base else "late"
+        yield Finding(
+            "late sensor", Severity.NOTE,
+            f"{who} is recorded {1e3 * abs(delay):.4g} ms {word} against {whom} (standard deviation {1e3 * std:.1g} "
+            "ms), as by a clock or a filter of its own; that is taken off before anything else is judged",
+            f"bring the records to one clock, or state {key} (s) in the test's description",
+            channel=None if delays.of_base else who, numbers={"delay": delay, "std": std},
+        )  # fmt: skip
+
+
+def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding, ...]:
     """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
 
     Raises InputError where one spoils all channels, or a channel of a problem whose model has a form of its own, so
     that a search would be in vain.
     """
     problem, declared = prepared.stated, prepared.stated.declared
-    tests = [problem.measurement] * (problem.misfit is None)
-    tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
-    found = of_tests([_of_test(prepared, declared, test, first=test is problem.measurement) for test in tests])
+    fitted = clocks[problem.misfit is not None :]
+    found = of_tests([_of_test(prepared, declared, clock, first=clock is clocks[0]) for clock in fitted])
     every = tuple(found)
     in_vain = [one.severity is Severity.BLOCKING or (is_gross(one) and not declared.free_modes) for one in every]
     refuse(*zip(in_vain, map(str, every), strict=True))
     return every
 
 
-def _of_test(problem: Prepared, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
+def _of_test(problem: Prepared, declared: Formulation, clock: Clock, *, first: bool) -> list[Finding]:
+    test = clock.test
     try:
-        terms = direct_terms(test)
+        terms = direct_terms(test, clock.beside)
         found = mistakes_of(test, terms)
         if found and terms is not None and terms.misfit <= CONJUGATED and not test.is_whole:
-            # Of records cut in motion, transients that were left in look like delays and gains.
+            # Of records cut in motion, transients that were left in look like gains.
             test = as_whole(test)
             if test.is_whole:
                 terms = direct_terms(test)

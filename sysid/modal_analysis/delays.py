@@ -1,0 +1,385 @@
+r"""Delays of the sensors and of the force against the base, by what their records leave beside modes.
+
+A channel that is late by tau records :math:`e^{-i w \tau}` times its motion, which modes with real residues do not
+make: beside poles, real residues, and terms without poles, a column ``i w`` times its own record tells its delay.
+Delays of many periods are first looked for one channel at a time, on a grid, by what real residues leave. Damping that
+couples modes turns residues too, one by one: where complex residues explain the records better than delays do, delays
+are asked for beside these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.errors import InputError, refuse
+from sysid.measurement.clocks import without_delays
+from sysid.measurement.in_time import as_whole
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import factors_of_runs
+from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_poles, beside_poles_at
+from sysid.modal_analysis.least_squares import units_of
+from sysid.modal_analysis.pole_functions import orthonormal
+from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.response import stacked
+from sysid.nlp import one_thread
+from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import ROUND_OFF, beyond_chance, most_deviations
+
+_PERIODS = 15  # of the last line, either way, that a delay is looked for in
+_LEAST_TURN = 1e-4  # rad at the last line: what a smaller delay does shows in no result
+
+
+@dataclass(frozen=True, eq=False)
+class Delays:
+    """Delays against the base, s: of the sensors and then of the force, where one was measured, (k,).
+
+    Attributes
+    ----------
+    values, std : (k,)
+        Zero for channels that are on the base's clock.
+    of_base : bool
+        True where all share one: then it is the base that is early.
+    """
+
+    values: Array
+    std: Array
+    of_base: bool = False
+
+    @classmethod
+    def none(cls, test: Measurement) -> Delays:
+        """Those of a test on one clock."""
+        zero = np.zeros(test.n_sensors + (test.force is not None))
+        return cls(zero, zero)
+
+    def __bool__(self) -> bool:
+        return bool(np.any(self.values))
+
+    def at(self, told: NDArray[np.intp], count: int) -> Delays:
+        """These as those of some of so many channels, where the others tell none."""
+        values, std = np.zeros((2, count))
+        values[told], std[told] = self.values, self.std
+        return Delays(values, std, self.of_base)
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the fields by their names; `from_tree` takes them back."""
+        return {"values": self.values, "std": self.std, "of_base": self.of_base}
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any], test: Measurement) -> Delays:
+        """Give those of a test that `to_tree` made a tree of; refused where they are of another."""
+        found, shape = cls(**tree), cls.none(test).values.shape
+        parts = found.values, found.std
+        sound = all(isinstance(one, np.ndarray) and one.shape == shape and np.all(np.isfinite(one)) for one in parts)
+        refuse((not sound, "the stored delays are of another test, or hold what is no number"))
+        return found
+
+
+def stored_delays(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Delays]:
+    """Delays of the tests of a stored problem; results of before hold none."""
+    found = tree.get("delays") or [None] * len(tests)
+    return [
+        Delays.none(test) if one is None else Delays.from_tree(one, test)
+        for one, test in zip(found, tests, strict=False)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """A test on the clock of its base: without its delays, and what its poles leave, where these show."""
+
+    test: Measurement
+    delays: Delays
+    beside: BesidePoles | None
+
+    @classmethod
+    def of(cls, given: Measurement) -> Clock:
+        """Take off the delays that a test shows."""
+        try:
+            beside = beside_poles(given)
+            delays = find_delays(given, beside)
+            if delays and (whole := as_whole(given)) is not given:
+                # Of records cut in motion, transients that were left in look like delays.
+                delays = find_delays(whole, beside_poles(whole))
+            if not delays:
+                return cls(given, delays, beside)
+            test = without_delays(given, delays.values)
+            return cls(test, delays, beside_poles(test))
+        except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
+            return cls(given, Delays.none(given), None)
+
+
+def beyond_noise(values: Array, covariance: Array, least: float) -> Delays | None:
+    """The fewest delays that explain what was found, with this covariance; None where chance or nothing does.
+
+    One of the base is tried first, then as few channels as leave the others to chance. Delays below `least` are none.
+    """
+    inverse = np.linalg.pinv(covariance, hermitian=True)
+    count = int(values.size)
+    if values @ inverse @ values < beyond_chance(count):
+        return None
+    ones = inverse.sum(axis=0)
+    mean, error = float(ones @ values / ones.sum()), float(1 / np.sqrt(ones.sum()))
+    left = values - mean
+    if count > 1 and left @ inverse @ left < beyond_chance(count - 1):
+        of_base = Delays(np.full(count, mean), np.full(count, error), True)
+        return of_base if abs(mean) > max(least, most_deviations() * error) else None
+    late = np.zeros(count, bool)
+    for channel in np.argsort(-np.abs(values) / np.sqrt(np.diag(covariance))):
+        late[channel] = True
+        rest = np.linalg.pinv(covariance[np.ix_(~late, ~late)], hermitian=True)
+        if values[~late] @ rest @ values[~late] < beyond_chance(count - int(np.count_nonzero(late))):
+            break
+    carried = covariance[np.ix_(late, ~late)] @ rest
+    found, std = np.zeros(count), np.zeros(count)
+    found[late] = values[late] - carried @ values[~late]
+    std[late] = np.sqrt(np.diag(covariance[np.ix_(late, late)] - carried @ covariance[np.ix_(~late, late)]))
+    found[np.abs(found) < np.maximum(least, most_deviations(count) * std)] = 0.0
+    std[found == 0] = 0.0
+    return Delays(found, std) if np.any(found) else None
+
+
+@one_thread()
+def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
+    """Delays of a test, from poles beside terms without any; none where these do not tell them.
+
+    Exact, and with deviations of their own, for spectra; of whole records, whose base has noise too, those that
+    matter to a fit, which finds what is left: see `sysid.modal_analysis.fit`.
+    """
+    none = Delays.none(test)
+    if beside is None:
+        return none
+    still, clocks = _joined(beside.test), _clocks(test)
+    first = _Late.on(still, clocks, np.zeros(none.values.size), beside.at.poles)
+    complex_ = _Late.on(still, clocks, first.delays, beside.at.poles, complex_residues=True)
+    if first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
+        return none
+    end = _settled(first)
+    turn = 2 * np.pi * test.freq[-1] * np.abs(end.delays).max()
+    if turn > 1 or complex_.explains_more_than(end):  # perhaps many periods late, of which steps find one alone
+        far, at = _on_grid(beside.test, still, clocks)
+        if at is not None and np.any(far):
+            other = _settled(_Late.on(still, clocks, far, at.at.poles))
+            end = other if other.explains_more_than(end) else end
+    if complex_.explains_more_than(end):
+        end = _settled(complex_)
+    return _found(end, test) or none
+
+
+def _clocks(test: Measurement) -> NDArray[np.intp]:
+    """Which delay each channel has, (n_sensors + d,): that of the force is one in all directions."""
+    force = 0 if test.force is None else test.n_base
+    return np.concatenate([np.arange(test.n_sensors), np.full(force, test.n_sensors)])
+
+
+def _joined(test: Measurement) -> Measurement:
+    """Sensors and force as channels of a test whose base carries nothing along, as terms without poles are free."""
+    if test.force is None:
+        return replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
+    std, force_std = test.response_std, test.force_std
+    if std is not None:
+        if force_std is None:
+            force_std = np.full(test.force.shape, np.sqrt(np.mean(np.abs(test.force) ** 2)))
+        std = np.concatenate([std, force_std], axis=1)
+    response = np.concatenate([test.response, test.force], axis=1)
+    return replace(
+        test, response=response, rigid_body=np.zeros((response.shape[1], test.n_base)), sensors=None,
+        response_std=std, force=None, force_std=None,
+    )  # fmt: skip
+
+
+class _Late:
+    """Channels without their delays, fitted on poles, residues and terms 1 and w²; what is left tells of the delays.
+
+    Parameters
+    ----------
+    still : Measurement
+        As `_joined` gives it, with its delays.
+    clocks : (channels,)
+        Which delay each channel has.
+    delays : (k,), s
+    poles : (2m,)
+        log w_k, then log zeta_k.
+    """
+
+    def __init__(
+        self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, *, complex_residues: bool
+    ) -> None:
+        self.still, self.clocks, self.delays, self.poles = still, clocks, delays, poles
+        self.complex_residues = complex_residues
+        self.omega, self.ratios = np.exp(poles.reshape(2, -1))
+        test = without_delays(still, delays[clocks])
+        self.records = records = Records(test)
+        square = (test.freq / test.freq[-1]) ** 2
+        direct = records.basis(np.stack([np.ones_like(square), square]) + 0j, records.driven)
+        functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
+        direct = np.hstack([direct, _ends_of_turned(test, records)])
+        self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
+        answered = self.basis.answers(records.data)
+        self.left = records.data - self.basis.times(answered)
+        beta = np.linalg.pinv(R, rcond=ROUND_OFF) @ answered / size[:, None]
+        of_poles = len(R) - functions.shared.shape[1]  # behind those of one run each, and those without poles
+        residues = functions.in_order([beta[: of_poles - direct.shape[1]], beta[of_poles:]])
+        self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
+        self.unknowns = len(R) * self.left.shape[1]
+        least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
+        self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+
+    @classmethod
+    def on(
+        cls, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, complex_residues: bool = False
+    ) -> _Late:
+        """The same, with real residues where no others are asked for."""
+        return cls(still, clocks, delays, poles, complex_residues=complex_residues)
+
+    def moved(self, poles: Array, delays: Array) -> _Late:
+        """The fit after a step, in which no pole becomes one that answers like a term without poles."""
+        m = self.omega.size
+        poles = self.poles + np.clip(poles, -0.3, 0.3)
+        poles[m:] = np.minimum(poles[m:], np.log(MOST_DAMPED))
+        return _Late.on(self.still, self.clocks, self.delays + delays, poles, self.complex_residues)
+
+    @cached_property
+    def shared_errors(self) -> float:
+        """Factor by which errors that neighbouring lines share weigh more."""
+        squares = float(np.sum(self.left**2))
+        return self.records.noise(self.left, self.unknowns) / self.records.variance(squares, self.unknowns)
+
+    def explains_more_than(self, other: _Late) -> bool:
+        """True where the likelihood is larger, each channel with its own level of noise, than Schwarz's price says."""
+        numbers = self.left.size / min(self.shared_errors, other.shared_errors)
+        more = self.unknowns - other.unknowns + np.count_nonzero(self.delays) - np.count_nonzero(other.delays)
+        return numbers * np.mean(np.log(other.level / self.level)) > more * np.log(numbers) / 2
+
+    @cached_property
+    def equations(self) -> tuple[Array, Array]:
+        """Normal matrix of poles and delays, each channel in units of its level, and descent."""
+        records, level = self.records, self.level
+        turned = replace(self.records_test, response=2j * np.pi * self.still.freq * self.records_test.response)
+        late = Records(turned).data
+        for _ in range(2):  # once leaves round-off of what is nearly along the basis
+            late = late - self.basis.times(self.basis.answers(late))
+        slopes = records.pole_slopes(self.omega, self.ratios, velocity=self.complex_residues)
+        beside = self.basis.beside(slopes)
+        of_left, of_late = (beside.products(beside.shared.T @ rows, rows) for rows in (self.left, late))
+        normal, descent = beside.pole_equations(of_left / level, self.residues / level)
+        each = np.concatenate([self.residues, self.residues]).reshape(of_late.shape)
+        across = (of_late * each / level**2).reshape(self.poles.size, -1, level.size).sum(axis=1)
+        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, level.size // self.clocks.size)]
+        across, size = -across @ of_clock, np.sum(late**2 / level**2, axis=0) @ of_clock
+        both = np.block([[normal, across], [across.T, np.diag(size)]])
+        return both, np.concatenate([descent, -np.sum(late * self.left / level**2, axis=0) @ of_clock])
+
+    @property
+    def records_test(self) -> Measurement:
+        """The channels without their delays."""
+        return without_delays(self.still, self.delays[self.clocks])
+
+    def step(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+        """A damped step of poles and delays, and the covariance of the latter; zero for those that nothing tells."""
+        normal, descent = self.equations
+        unit = units_of(normal)
+        values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + damping * np.eye(unit.size))
+        root = unit[:, None] * vectors / np.sqrt(np.maximum(values, ROUND_OFF * values[-1]))
+        step, m = root @ (descent @ root), self.poles.size
+        freedom = max(len(self.left) - self.unknowns // self.left.shape[1], 1)
+        return step[:m], step[m:], self.shared_errors / freedom * root[m:] @ root[m:].T
+
+    def promise(self) -> float:
+        """Sum of squares of the delays that one step finds, in units of their errors."""
+        _, delays, covariance = self.step()
+        return float(delays @ np.linalg.pinv(covariance, hermitian=True) @ delays)
+
+
+def _ends_of_turned(test: Measurement, records: Records) -> Array:
+    """Columns of what turned records of each run hold that is not theirs, (rows, k)."""
+    if test.whole is None:
+        return np.zeros((len(records.data), 0))
+    weight = factors_of_runs(test.response_std, test.response.shape)[1][records.run, records.line]
+    times, _ = test.whole.pulses(test.freq[-1])
+    pulses = weight * np.exp(2j * np.pi * np.multiply.outer(times, test.freq[records.line]))
+    by_run = [np.where(records.run == run, pulses, 0.0) for run in test.whole.moving]
+    return stacked(np.concatenate([pulses[:0], *by_run]))
+
+
+def _settled(best: _Late, steps: int = 15, near: float = 0.05) -> _Late:
+    """The fit after Levenberg-Marquardt steps, until one would move no delay by so small a part of its deviation."""
+    damping = 1e-3
+    for _ in range(steps):
+        poles, delays, covariance = best.step(damping)
+        trial = best.moved(poles, delays)
+        if np.sum(np.log(trial.level)) > np.sum(np.log(best.level)):
+            damping *= 10
+            continue
+        best, damping = trial, max(damping / 10, ROUND_OFF)
+        if np.all(np.abs(delays) <= near * np.sqrt(np.diag(covariance))):
+            break
+    return best
+
+
+def _found(end: _Late, test: Measurement) -> Delays | None:
+    """Delays beyond chance at the end of a fit, of the channels that tell them."""
+    told = np.flatnonzero(np.diag(end.equations[0])[end.poles.size :] > 0)
+    covariance = end.step()[2][np.ix_(told, told)]
+    found = beyond_noise(end.delays[told], covariance, least_delay(test))
+    return found and found.at(told, end.delays.size)
+
+
+def least_delay(test: Measurement) -> float:
+    """Delay, s, below which what it does shows in no result."""
+    return float(_LEAST_TURN / (2 * np.pi * test.freq[-1]))
+
+
+def _on_grid(
+    test: Measurement, still: Measurement, clocks: NDArray[np.intp], lines: int = 400, less: float = 0.8
+) -> tuple[Array, BesidePoles | None]:
+    """Delays of many periods, s, (k,), each where real residues leave least, of some lines and on a grid; and poles.
+
+    A sensor moves with the base as its row of rigid_body says: with that open, half a period and the other sign of all
+    residues would do as well. Poles are looked for anew once delays are taken off; `less` is left of squares.
+    """
+    delays, zero = np.zeros(clocks.max() + 1), 4 * _PERIODS
+    grid = np.arange(-zero, zero + 1) / (4 * test.freq[-1])
+    thin = np.arange(test.freq.size) % -(-test.freq.size // lines) == 0
+    for _ in range(3):
+        beside = beside_poles_at(without_delays(still, delays[clocks]))
+        if beside is None:
+            break
+        left = _left_at(test.at(thin), still.at(thin), clocks, delays + grid[:, None], beside)
+        best = np.argmin(left, axis=0)
+        moved = np.where(left[best, np.arange(delays.size)] < less * left[zero], grid[best], 0.0)
+        if not np.any(moved):
+            break
+        delays = delays + moved
+    return delays, beside
+
+
+def _left_at(
+    test: Measurement, still: Measurement, clocks: NDArray[np.intp], delays: Array, beside: BesidePoles
+) -> Array:
+    """Squares that real residues leave of each clock's channels at delays (grid, k), (grid, k)."""
+    carried = np.zeros((clocks.size, test.n_base))
+    carried[: test.n_sensors] = test.rigid_body
+    records, relative = Records(still), Records(replace(still, rigid_body=carried))
+    along = relative.data - records.data  # less what moves with the base
+    functions = records.functions(beside.at.omega, beside.at.ratios)
+    square = (still.freq / still.freq[-1]) ** 2
+    found = np.zeros(delays.shape)
+    real, imaginary = records.data.reshape(2, -1, records.data.shape[1])
+    of_clock = np.tile(clocks, records.data.shape[1] // clocks.size)
+    weighs = of_clock >= test.n_sensors  # the force, whose mass is open
+    for some, direct in ((~weighs, square[None]), (weighs, np.stack([np.ones_like(square), square]))):
+        terms = records.basis(direct + 0j, records.driven)
+        basis = orthonormal(functions._replace(shared=np.hstack([terms, functions.shared])))[0]
+        for row, at in zip(found, delays, strict=True):
+            turn = np.exp(2j * np.pi * records.freq[records.line, None] * at[of_clock[some]])
+            turned: ComplexArray = (real[:, some] + 1j * imaginary[:, some]) * turn
+            data = np.concatenate([turned.real, turned.imag]) + along[:, some]
+            squares = np.sum(data**2, axis=0) - np.sum(basis.answers(data) ** 2, axis=0)
+            np.add.at(row, of_clock[some], squares)
+    return found
