@@ -269,11 +269,11 @@ class _Late:
         of_left, of_late = (beside.products(beside.shared.T @ rows, rows) for rows in (self.left, late))
         normal, descent = beside.pole_equations(of_left / level, self.residues / level)
         each = np.concatenate([self.residues, self.residues]).reshape(of_late.shape)
-        across = (of_late * each / level**2).reshape(self.poles.size, -1, level.size).sum(axis=1)
+        across = (of_late / level * (each / level)).reshape(self.poles.size, -1, level.size).sum(axis=1)
         of_clock = np.eye(self.delays.size)[np.tile(self.clocks, level.size // self.clocks.size)]
-        across, size = -across @ of_clock, np.sum(late**2 / level**2, axis=0) @ of_clock
+        across, size = -across @ of_clock, np.sum((late / level) ** 2, axis=0) @ of_clock
         both = np.block([[normal, across], [across.T, np.diag(size)]])
-        return both, np.concatenate([descent, -np.sum(late * self.left / level**2, axis=0) @ of_clock])
+        return both, np.concatenate([descent, -np.sum(late / level * (self.left / level), axis=0) @ of_clock])
 
     @property
     def records_test(self) -> Measurement:

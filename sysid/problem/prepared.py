@@ -463,5 +463,5 @@ class Prepared(SearchSpace):
         given = all(one.records is one.given for one in self.screened.modal)
         poles = self.geometry.found if given else None
         fits = [one.record_fit and one.record_fit.to_tree() for one in self.modal]
-        delays = [one.delays and one.delays.to_tree() for one in self.modal]
+        delays = [None if one.delays is None else one.delays.to_tree() for one in self.modal]
         return {**self.stated.to_tree(), "poles": poles and asdict(poles), "fits": fits, "delays": delays}
