@@ -29,7 +29,7 @@ from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import stacked
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import ROUND_OFF, beyond_chance, most_deviations
+from sysid.structure.thresholds import ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
 
 _PERIODS = 15  # of the last line, either way, that a delay is looked for in
 _LEAST_TURN = 1e-4  # rad at the last line: what a smaller delay does shows in no result
@@ -121,7 +121,7 @@ def beyond_noise(values: Array, covariance: Array, least: float) -> Delays | Non
     """
     inverse = np.linalg.pinv(covariance, hermitian=True)
     count = int(values.size)
-    if values @ inverse @ values < beyond_chance(count):
+    if not count or values @ inverse @ values < beyond_chance(count):
         return None
     ones = inverse.sum(axis=0)
     mean, error = float(ones @ values / ones.sum()), float(1 / np.sqrt(ones.sum()))
@@ -244,6 +244,13 @@ class _Late:
         poles[m:] = np.minimum(poles[m:], np.log(MOST_DAMPED))
         return _Late.on(self.still, self.clocks, self.delays + delays, poles, self.complex_residues)
 
+    @property
+    def misfits(self) -> Array:
+        """Relative residual of the channels of each clock, (k,)."""
+        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, self.level.size // self.clocks.size)]
+        size = np.sum(self.records.data**2, axis=0) @ of_clock
+        return np.sqrt(self.level**2 @ of_clock / np.maximum(size, np.finfo(float).tiny))
+
     @cached_property
     def shared_errors(self) -> float:
         """Factor by which errors that neighbouring lines share weigh more."""
@@ -323,8 +330,9 @@ def _settled(best: _Late, steps: int = 15, near: float = 0.05) -> _Late:
 
 
 def _found(end: _Late, test: Measurement) -> Delays | None:
-    """Delays beyond chance at the end of a fit, of the channels that tell them."""
-    told = np.flatnonzero(np.diag(end.equations[0])[end.poles.size :] > 0)
+    """Delays beyond chance at the end of a fit, of the channels that tell them and that it explains."""
+    shown = np.diag(end.equations[0])[end.poles.size :] > 0
+    told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
     covariance = end.step()[2][np.ix_(told, told)]
     found = beyond_noise(end.delays[told], covariance, least_delay(test))
     return found and found.at(told, end.delays.size)
