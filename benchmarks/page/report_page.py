@@ -1,4 +1,4 @@
-"""The report page: size, first screen, controls, contrast and width in a browser, and print."""
+"""The report page: first screen, controls, contrast and width in a browser, and print."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from sysid.report import report
 
 WIDTHS = ((1280, False), (768, True), (380, False), (380, True))  # pixels; dark
 CONTRAST = 4.5  # of text, WCAG 2.2 AA
-MOST_BYTES = 5 * 2**20
-MOST_OF_FORTY = 2e6  # bytes
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -27,16 +25,13 @@ def lines(reduced: bool) -> Iterator[Line]:
         command = [sys.executable, "-m", "sysid", "run", "cantilever_tower", "--quiet", "--out", str(where / "tower")]
         subprocess.run(command, check=True, cwd=where)
         pages = {"tower": (where / "tower" / report.FILE_NAME).read_text(encoding="utf-8")}
-        large = sysid.write_report(answer(20, 1000, force=True), where / "large")
-        yield below("bytes of the page of 20 sensors, 3 directions, 1,000 lines", large.stat().st_size, MOST_BYTES)
-        forty = sysid.write_report(answer(40, 600, force=True), where / "forty")
-        text = "bytes of the page of 40 sensors, 3 directions and force, 600 lines"
-        yield below(text, forty.stat().st_size, MOST_OF_FORTY)
         if browser.CHROMIUM is None:
             yield Line("the page in a browser", "no Chromium is installed")
             return
-        pages["large"] = large.read_text(encoding="utf-8")
-        for name, page in list(pages.items())[: 1 if reduced else 2]:
+        if not reduced:
+            large = sysid.write_report(answer(20, 1000, force=True), where / "large")
+            pages["large"] = large.read_text(encoding="utf-8")
+        for name, page in pages.items():
             yield from _in_a_browser(name, page, where, WIDTHS[::3] if reduced else WIDTHS)
         still = browser.seen_without_scripts(pages["tower"], where, 380)
         shown = still["sheets"], still["modes"], still["sideways"]
