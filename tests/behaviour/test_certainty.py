@@ -54,7 +54,7 @@ def test_a_sensor_that_is_the_mean_of_two_others_is_no_degree_of_freedom(random_
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_a_lumped_total_on_skew_sensors_is_told(no_other_answers, force):
+def test_a_lumped_total_on_skew_sensors_is_told(force):
     """Two points with sensors at ± 45 degrees: the sum over four sensors is twice what moves in one direction."""
     c = np.sqrt(0.5)
     G = np.array([[c, c], [c, -c], [c, c], [c, -c]])

@@ -136,7 +136,7 @@ def test_whole_records_show_a_dashpot_and_no_further_modes(estimated, dashpot):
 
 def test_without_a_force_modes_are_counted_and_no_coupling_is_told():
     """Accelerations leave the scale of each mode open, and with it that of the couplings."""
-    found = fit_modes(record(building(), 0.005, np.random.default_rng(4), force=False))
+    found = fit_modes(record(building(), 0.005, np.random.default_rng(4), samples=6000, force=False))
     assert found.omega.size == 3 and found.coupling is None and found.record_fit.parameters.coupling is not None
 
 
