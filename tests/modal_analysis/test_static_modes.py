@@ -10,7 +10,6 @@ from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous_structure
 from benchmarks.records.simulated import Modes as SimulatedModes
 from benchmarks.records.simulated import Run, random_motion, with_noise
-from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.record_model import RecordModel
@@ -152,9 +151,9 @@ def whole(truth):
 
 
 @pytest.fixture(scope="module")
-def fits(whole):
+def fits(fitted_once, whole):
     """Of whole records, without them and with them."""
-    fit = whole_fit(whole)
+    fit = fitted_once(whole)
     return fit, with_static_modes(fit)
 
 
