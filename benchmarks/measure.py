@@ -21,10 +21,9 @@ def run(benchmarks: Sequence[Benchmark], reduced: bool, processes: int = 1) -> l
     With several processes those that judge no seconds run first, side by side, each printed when it has ended.
     """
     begun = time.perf_counter()
-    beside = [b for b in benchmarks if processes > 1 and not b.timed]
+    beside = [b for b in benchmarks if processes > 1 and not b.alone(reduced)]
     ends = []
-    # A fresh process for each, as where it runs alone.
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(processes, _fresh_processes(), max_tasks_per_child=1) as pool:
         for future in as_completed([pool.submit(_captured, b, reduced) for b in beside]):
             text, end = future.result()
             print(text, end="", flush=True)
@@ -36,6 +35,13 @@ def run(benchmarks: Sequence[Benchmark], reduced: bool, processes: int = 1) -> l
     for text in unmet:
         print(f"NOT MET  {text}")
     return unmet
+
+
+def _fresh_processes() -> multiprocessing.context.BaseContext:
+    """A process for each benchmark, as where it runs alone; what nearly all of them import is imported once."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["sysid", "scipy.optimize", "scipy.stats", "scipy.signal", "matplotlib.pyplot"])
+    return context
 
 
 class End(NamedTuple):

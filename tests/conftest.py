@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis import fit
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.model import Geometry
 
@@ -61,6 +62,21 @@ def no_other_answers_in_module():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
         yield
+
+
+@pytest.fixture(scope="module")
+def fitted_once():
+    """Fit whole records that several tests of a module identify once: gives the function that does, `whole_fit`."""
+    fits, of = {}, fit.whole_fit
+
+    def once(test, *, monitor=None):
+        if id(test) not in fits:
+            fits[id(test)] = test, of(test)  # the test too, so that no other one gets its place in memory
+        return fits[id(test)][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "whole_fit", once)
+        yield once
 
 
 def _geometry(rng, n, d):

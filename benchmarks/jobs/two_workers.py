@@ -27,7 +27,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     worker can gain on this machine at that time, which two free processors halve. The reduced form tells the share
     without holding it to the bound.
     """
-    rounds = 3 if reduced else 12
+    rounds = 2 if reduced else 12
     recipe = sysid.Recipe("cantilever_tower")
     with threadpool_limits(limits=1):
         x = sysid.identify(catalogue.build(recipe), rng=0).x

@@ -20,16 +20,15 @@ SECONDS = {10: 0.3, 20: 2.0}  # bounds on the medians, by the number of modes
 def lines(reduced: bool) -> Iterator[Line]:
     """Medians over random structures, by kinds of tests, on one thread: processor time, which waits for nobody else.
 
-    Of each structure the least of so many rounds counts: what others do on the machine still takes its caches. As slow
-    spells of a shared machine last some ten seconds, the reduced form has more rounds of the quick tests, and up to
-    three times as many while the bound is not met. A machine can be slow for hours: the reduced form judges seconds at
-    full speed, as fixed work beside tells it.
+    Of each structure the least of some rounds counts: what others do on the machine still takes its caches. As slow
+    spells of a shared machine last some ten seconds, the reduced form has more rounds while the bound is not met. A
+    machine can be slow for hours: the reduced form judges seconds at full speed, as fixed work beside tells it.
     """
     count = 3 if reduced else 10
     directions: dict[str, int | None] = {"d = 3": 3} if reduced else {"d = 3": 3, "d = 1 to 3": None}
     kinds = [(label, d, force) for label, d in directions.items() for force in (False, True)]
     for n, bound in SECONDS.items():
-        rounds = 8 if reduced and n == min(SECONDS) else 3
+        rounds, most = (2, 180 // n) if reduced else (3, 3)
         tests = {
             f"{label}, {'with' if force else 'no'} force": [_test(seed, n, d, force=force) for seed in range(count)]
             for label, d, force in kinds
@@ -37,12 +36,10 @@ def lines(reduced: bool) -> Iterator[Line]:
         with threadpool_limits(limits=1):
             _seconds(next(iter(tests.values()))[0])  # what is imported at the first call is not counted
             taken, beside = list[list[list[float]]](), list[float]()
-            while len(taken) < rounds or (
-                reduced and len(taken) < 3 * rounds and _seconds_at_most(taken, beside) > bound
-            ):
+            while len(taken) < rounds or (len(taken) < most and _seconds_at_most(taken, beside) > bound):
                 taken.append([[_seconds(test) for test in group] for group in tests.values()])
                 if reduced:
-                    beside.append(fixed_work(1))
+                    beside.append(fixed_work(3))
         medians = np.median(np.min(taken, axis=0), axis=1)
         shown = "; ".join(f"{kind} {value:.2f}" for kind, value in zip(tests, medians, strict=True))
         what = f"largest median over {count} structures, least of {len(taken)}, processor s"

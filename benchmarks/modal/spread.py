@@ -16,7 +16,14 @@ WORKERS = 2
 
 
 def spread(function: Callable[[Task], Answer], tasks: Iterable[Task]) -> list[Answer]:
-    """Answers of a function at the top of a module to each task, in the tasks' order."""
+    """Answers of a function at the top of a module to each task, in the tasks' order.
+
+    A benchmark that runs beside others has one processor: it does them itself, and starts nobody who would first import
+    all that it has imported.
+    """
+    if multiprocessing.parent_process() is not None:
+        with threadpool_limits(limits=1):
+            return list(map(function, tasks))
     context = multiprocessing.get_context("spawn")  # a fork would copy the threads' locks
     with ProcessPoolExecutor(WORKERS, mp_context=context, initializer=_one_thread) as pool:
         return list(pool.map(function, tasks))

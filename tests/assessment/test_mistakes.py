@@ -144,7 +144,7 @@ def test_right_units_show_in_the_first_structures_that_a_model_allows(monkeypatc
     assert 1 <= len(seen) <= 6
 
 
-def test_sensors_that_are_swapped_in_a_written_model_are_told():
+def test_sensors_that_are_swapped_in_a_written_model_are_told(no_other_answers):
     test = CAUSES["swapped"].made(right(SPECTRA, force=False)).test
     result = identify(problem("written", test), strategy=sysid.Continuation(1), rng=0)
     first = result.findings[0]

@@ -72,3 +72,13 @@ def test_a_crash_beside_others_counts_too(package, capsys):
     alone = registry.Benchmark("no_module", "nothing", "-", "-", timed=True)
     assert len(measure.run([alone, missing], reduced=True, processes=2)) == 2
     assert "lines: 2; not met: 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "full", "reduced"),
+    [({}, False, False), ({"timed": True}, True, True), ({"timed": True, "reduced_timed": False}, True, False)],
+)
+def test_nothing_runs_beside_a_form_that_judges_seconds(package, given, full, reduced):
+    _, registry = package
+    benchmark = registry.Benchmark("module", "nothing", "-", "-", **given)
+    assert (benchmark.alone(False), benchmark.alone(True)) == (full, reduced)

@@ -1,5 +1,7 @@
 """Modes that dampers couple: responses against direct solves, poles of the state matrix, first order, fits."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from sysid.jobs.changes import drawn_from
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.coupled_modes import passive
 from sysid.modal_analysis.coupled_spectra import CoupledLines
-from sysid.modal_analysis.fit import fit_modes, whole_fit
+from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
@@ -37,7 +39,7 @@ def modes_of(structure):
     return modes, loss - np.diag(np.diag(loss))
 
 
-def record(structure, noise, rng, *, samples=6000, force=True):
+def record(structure, noise, rng, *, samples=3000, force=True):
     """A record of random motion, cut in motion: cosines that are no lines of it, each by a direct solve."""
     period = 7919  # a prime, longer than the record
     w = 2 * np.pi * np.arange(period // 2 + 1) * RATE / period
@@ -109,10 +111,15 @@ def test_slopes_of_plain_spectra_are_those_of_differences():
     np.testing.assert_allclose(-2 * made.gradient, slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
 
 
+@pytest.fixture(scope="module")
+def estimated():
+    """Give a function that fits modes to a record with a dashpot, N s/m, once."""
+    return functools.cache(lambda dashpot: fit_modes(record(building(dashpot), 0.005, np.random.default_rng(3))))
+
+
 @pytest.mark.parametrize("dashpot", [0.0, 2.0, 25.0])
-def test_whole_records_show_a_dashpot_and_no_further_modes(dashpot):
-    truth = building(dashpot)
-    found = fit_modes(record(truth, 0.005, np.random.default_rng(3)))
+def test_whole_records_show_a_dashpot_and_no_further_modes(estimated, dashpot):
+    truth, found = building(dashpot), estimated(dashpot)
     assert found.omega.size == 3
     if not dashpot:
         assert found.coupling is None
@@ -129,14 +136,13 @@ def test_whole_records_show_a_dashpot_and_no_further_modes(dashpot):
 
 def test_without_a_force_modes_are_counted_and_no_coupling_is_told():
     """Accelerations leave the scale of each mode open, and with it that of the couplings."""
-    found = fit_modes(record(building(), 0.005, np.random.default_rng(4), force=False))
+    found = fit_modes(record(building(), 0.005, np.random.default_rng(4), samples=6000, force=False))
     assert found.omega.size == 3 and found.coupling is None and found.record_fit.parameters.coupling is not None
 
 
-def test_a_stored_fit_keeps_its_couplings():
-    test = record(building(), 0.005, np.random.default_rng(5), samples=3000)
-    fit = whole_fit(test)
-    again = RecordFit.from_tree(fit.to_tree(), test)
+def test_a_stored_fit_keeps_its_couplings(estimated):
+    fit = estimated(25.0).record_fit
+    again = RecordFit.from_tree(fit.to_tree(), fit.test)
     assert again.chi2 == fit.chi2
     np.testing.assert_array_equal(again.parameters.coupling, fit.parameters.coupling)
     assert again.model.chi2(again.parameters, again.levels) == fit.model.chi2(fit.parameters, fit.levels)

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from benchmarks.records.simulated import Records, four_storeys, with_noise
-from sysid.modal_analysis.rough_poles import steady_sine
+from sysid.modal_analysis.rough_poles import at_sines_alone, steady_sine
 
 SETTING = four_storeys()
 RATE = SETTING.sample_rate
@@ -20,16 +20,30 @@ def measured(records: Records) -> sysid.Measurement:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("cycles", "noise", "seed"), [(129, 0, 0), (129, 0.01, 0), (129, 0.01, 16), (129.4, 0, 0)])
-def test_a_steady_sine_is_told_and_no_unit_or_sign_is_accused(cycles: float, noise: float, seed: int) -> None:
-    """Also where noise beside it passes for two modes of one frequency (the second and third)."""
-    f, rng = cycles / 30.0, np.random.default_rng(seed)
+def at_a_sine(cycles: float, noise: float) -> sysid.Measurement:
+    """Half a minute of so many cycles."""
+    f, rng = cycles / 30.0, np.random.default_rng(0)
     turn = np.exp(2j * np.pi * f * np.arange(30 * int(RATE)) / RATE)
     H, Z = SETTING.structure.transmissibility([f])[:, 0], SETTING.structure.base_force([f])[0]
     records = Records(turn.real[None], (H * turn).real, (Z * turn).real, RATE)
+    return measured(with_noise(records, rng, noise)[0])
+
+
+@pytest.mark.parametrize(("cycles", "noise"), [(129, 0), (129, 0.01), (129.4, 0)])
+def test_a_steady_sine_is_told_and_no_unit_or_sign_is_accused(cycles: float, noise: float) -> None:
     with pytest.raises(sysid.InputError, match=r"steady sine at 4\.3.* Hz") as caught:
-        sysid.identify(sysid.Problem(measured(with_noise(records, rng, noise)[0]), mass=sysid.FullMass()), rng=0)
+        sysid.identify(sysid.Problem(at_a_sine(cycles, noise), mass=sysid.FullMass()), rng=0)
     assert "exp(-iwt)" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("at", "alone"), [([4.3], True), ([4.3, 7.9], False), ([4.3, 7.9, 7.95], True), ([4.3, 7.9, 7.95, 9.0], False)]
+)
+def test_two_modes_at_one_frequency_beside_a_sine_are_noise(at: list[float], alone: bool) -> None:
+    """They cancel each other; a mode by itself is one that the noise of the base may have shown."""
+    test, omega = at_a_sine(129, 0.01), 2 * np.pi * np.array(at)
+    assert at_sines_alone(test, omega, np.full(omega.size, 0.02)) is alone
+    assert at_sines_alone(at_a_sine(129, 0.0), omega, np.full(omega.size, 0.02))
 
 
 def test_random_motion_is_no_steady_sine() -> None:

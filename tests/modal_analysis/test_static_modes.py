@@ -10,7 +10,6 @@ from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous_structure
 from benchmarks.records.simulated import Modes as SimulatedModes
 from benchmarks.records.simulated import Run, random_motion, with_noise
-from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.record_model import RecordModel
@@ -144,7 +143,7 @@ def test_deviations_are_those_of_a_dense_jacobian_with_the_far_pole_held(spectra
 def whole(truth):
     """A record cut in motion, its lines up to the fourth mode; sampled far above all modes."""
     rng = np.random.default_rng(2)
-    motion = random_motion(rng, 30.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
+    motion = random_motion(rng, 20.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
     records, _ = with_noise(Run.ringing(SimulatedModes.of(truth), motion, rng).records(), rng, 0.02)
     return sysid.Measurement.from_time(
         [(records.base, records.response, records.force)], 200.0, rigid_body=truth.rigid_body, band=(2.0, 15.0)
@@ -152,9 +151,9 @@ def whole(truth):
 
 
 @pytest.fixture(scope="module")
-def fits(whole):
+def fits(fitted_once, whole):
     """Of whole records, without them and with them."""
-    fit = whole_fit(whole)
+    fit = fitted_once(whole)
     return fit, with_static_modes(fit)
 
 
