@@ -309,7 +309,7 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
+    between = np.geomspace(omega.min(), max(omega.max(), 1.5 * records.lines[-1]), 4 * omega.size)
     lines = records.lines
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
@@ -332,7 +332,10 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+        error = records.fit(*more).squared_error
+        # With as many poles as before one has taken the place of another.
+        fell = without_velocity.squared_error - error > least * _noise(records, without_velocity, omega.size)
+        if more[0].size > omega.size - fell and error < to_beat:
             return more
     return None
 
