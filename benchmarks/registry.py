@@ -196,6 +196,9 @@ BENCHMARKS = (
         "6 min",
         "25 s",
     ),
+    Benchmark(
+        "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "8 min", "20 s"
+    ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 
