@@ -303,8 +303,9 @@ def _settled(
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
-    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
+    Candidates lie beside each pole, for two modes that share it, between the poles and just above the lines, where a
+    strong mode may have lost its pole, and, with modes below the lines, where most is left, as they may have cost
+    another its own. Damping that is not classical needs no pole: one more
     must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
