@@ -303,15 +303,16 @@ def _settled(
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, between the poles and just above the lines, where a
-    strong mode may have lost its pole, and, with modes below the lines, where most is left, as they may have cost
-    another its own. Damping that is not classical needs no pole: one more
-    must fit what the velocities of the poles cannot, or more than they all can.
+    Candidates lie beside each pole, for two modes that share it, between the poles, with as many as sensors just above
+    the lines too, where a strong mode may have lost its pole, and, with modes below the lines, where most is left, as
+    they may have cost another its own. Damping that is not classical needs no pole: one more must fit what the
+    velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    between = np.geomspace(omega.min(), max(omega.max(), 1.5 * records.lines[-1]), 4 * omega.size)
     lines = records.lines
+    many = omega.size >= records.n_sensors  # of those that a search begins with none may have been left above the lines
+    between = np.geomspace(omega.min(), max(omega.max(), many * 1.2 * lines[-1]), 4 * omega.size)
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
@@ -333,11 +334,12 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        error = records.fit(*more).squared_error
-        # With as many poles as before one has taken the place of another.
-        fell = without_velocity.squared_error - error > least * _noise(records, without_velocity, omega.size)
-        if more[0].size > omega.size - fell and error < to_beat:
-            return more
+        replaced = many and at[best] > lines[-1] and more[0].size == omega.size  # one has taken another's place
+        if more[0].size > omega.size or replaced:
+            error = records.fit(*more).squared_error
+            allowed = without_velocity.squared_error - least * _noise(records, without_velocity, omega.size)
+            if error < (min(to_beat, allowed) if replaced else to_beat):
+                return more
     return None
 
 
