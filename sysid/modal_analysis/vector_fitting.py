@@ -334,12 +334,12 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        replaced = many and at[best] > lines[-1] and more[0].size == omega.size  # one has taken another's place
-        if more[0].size > omega.size or replaced:
-            error = records.fit(*more).squared_error
-            allowed = without_velocity.squared_error - least * _noise(records, without_velocity, omega.size)
-            if error < (min(to_beat, allowed) if replaced else to_beat):
-                return more
+        # Of as many poles as before one above the lines has taken another's place, if what is left falls beyond chance.
+        grown, least_fall = more[0].size > omega.size, least * _noise(records, without_velocity, omega.size)
+        most = min(to_beat, (without_velocity.squared_error - least_fall, np.inf)[grown])
+        fewest = omega.size + 1 - (many and at[best] > lines[-1])
+        if more[0].size >= fewest and records.fit(*more).squared_error < most:
+            return more
     return None
 
 
