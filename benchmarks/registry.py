@@ -197,7 +197,7 @@ BENCHMARKS = (
         "25 s",
     ),
     Benchmark(
-        "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "8 min", "20 s"
+        "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "4 min", "20 s"
     ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )

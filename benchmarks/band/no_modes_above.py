@@ -17,7 +17,7 @@ from benchmarks.line import Line, below
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.older import COMMIT, answer_cases, workers
 
-STRUCTURES, DRAWS = range(8), 10
+STRUCTURES, DRAWS = range(8), 5
 SHORT, SHORT_DRAWS = (1, 6), 3
 NOISE, LOOSE = 0.01, 1e3
 LOSS = 1.05  # rms errors over those of an answer without residual modes
@@ -25,7 +25,7 @@ MATRICES = ("mass", "stiffness", "damping")
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Ten draws of each of eight structures; or three of two."""
+    """Five draws of each of eight structures; or three of two."""
     structures, draws = (SHORT, SHORT_DRAWS) if reduced else (STRUCTURES, DRAWS)
     tasks = [(seed, number) for seed in structures for number in range(draws)]
     with workers(Path(__file__)) as both:
