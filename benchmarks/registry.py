@@ -208,6 +208,15 @@ BENCHMARKS = (
         "20 s",
     ),
     Benchmark("band.exported", "answers in the band by other programs, in time, against the test", "8 min", "20 s"),
+    Benchmark(
+        "band.spacecraft_dummy",
+        "six base directions, 22 modes to 200 Hz: base drive and mass properties",
+        "6 min",
+        "25 s",
+    ),
+    Benchmark(
+        "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "4 min", "20 s"
+    ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 

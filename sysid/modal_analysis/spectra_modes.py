@@ -346,7 +346,7 @@ class ModeFit:
         return best
 
     def with_poles_above(self, best: ModalFit) -> ModalFit:
-        """The fit with further poles between the lines and the static modes, while the records ask for one.
+        """The fit with further poles above the lines, beside one or static modes, while the records ask for one.
 
         They are no modes, and need not stand out of chance: what they explain pulls at the modes in the lines. Akaike's
         criterion decides.
@@ -354,10 +354,10 @@ class ModeFit:
         test, last = self.test, 2 * np.pi * float(self.test.freq[-1])
         far, least = STATIC_POLE[0] * last * (1 + ROUND_OFF), 2 * (test.n_sensors + test.n_base + 2)
         short = replace(self, max_iterations=min(self.max_iterations, _TRIAL))
-        while self._goes_on and best.static and best.of_accelerations > EXACT:
+        while self._goes_on and best.of_accelerations > EXACT:
             omega, ratios = _poles_of(best)
             inside = np.count_nonzero(omega <= last)
-            if omega.size - 1 - inside >= max(test.n_base, 2):
+            if not 0 < omega.size - inside < max(test.n_base, 2) + bool(best.static):
                 break
             modes = self._with_mode(best, *self._most_above(omega, ratios))
             more = short._from(modes, best.rigid, best.static, together=False)

@@ -303,14 +303,16 @@ def _settled(
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
-    Candidates lie beside each pole, for two modes that share it, between the poles, and, with modes below the lines,
-    where most is left, as they may have cost another its pole. Damping that is not classical needs no pole: one more
-    must fit what the velocities of the poles cannot, or more than they all can.
+    Candidates lie beside each pole, for two modes that share it, between the poles, with as many as sensors just above
+    the lines too, where a strong mode may have lost its pole, and, with modes below the lines, where most is left, as
+    they may have cost another its own. Damping that is not classical needs no pole: one more must fit what the
+    velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
     lines = records.lines
+    many = omega.size >= records.n_sensors  # of those that a search begins with none may have been left above the lines
+    between = np.geomspace(omega.min(), max(omega.max(), many * 1.2 * lines[-1]), 4 * omega.size)
     if omega.min() < lines[0]:
         left = np.sum(np.abs(records.in_runs(without_velocity.left)) ** 2, axis=(0, 2))[-lines.size :]
         between = np.append(between, lines[np.argmax(np.minimum(left[1:], left[:-1]))])  # one line alone is no mode
@@ -332,7 +334,11 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
             continue
         tried = best
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
-        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+        # Of as many poles as before one above the lines has taken another's place, if what is left falls beyond chance.
+        grown, least_fall = more[0].size > omega.size, least * _noise(records, without_velocity, omega.size)
+        most = min(to_beat, (without_velocity.squared_error - least_fall, np.inf)[grown])
+        fewest = omega.size + 1 - (many and at[best] > lines[-1])
+        if more[0].size >= fewest and records.fit(*more).squared_error < most:
             return more
     return None
 

@@ -145,6 +145,22 @@ def test_where_velocities_leave_round_off_no_further_pole_is_tried(monkeypatch):
     assert find_poles(test).omega.size == 3
 
 
+@pytest.mark.parametrize("poles", [[0, 1, 2], [0, 1, 1, 2]])
+def test_a_strong_mode_just_above_the_lines_that_lost_its_pole_is_found_again(poles):
+    """The second time in the place of a pole too many."""
+    rng, freq = np.random.default_rng(3), np.linspace(2.0, 20.0, 300)
+    w, omega, zeta = 2 * np.pi * freq, 2 * np.pi * np.array([4.0, 9.0, 14.0, 21.8]), np.array([0.01, 0.015, 0.01, 0.02])
+    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (zeta * omega)[:, None] * w)
+    residues = rng.normal(size=(4, 3, 2)) * np.array([1, 1, 1, 4])[:, None, None]
+    G = np.eye(2)[[0, 0, 1]]
+    response = np.einsum("knd,kf->dnf", residues, g) + G.T[..., None]
+    response += 0.003 * (rng.normal(size=response.shape) + 1j * rng.normal(size=response.shape))
+    records = Records(Measurement(freq, np.eye(2)[..., None] * np.ones(freq.size), response, rigid_body=G))
+    start = omega[poles] * np.where(np.arange(len(poles)) == 2, 1.003, 1.0)
+    found = vector_fitting._with_another(records, start, zeta[poles], vector_fitting._Progress(None, records))
+    np.testing.assert_allclose(np.sort(found[0]), omega, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("n", "d"), [(4, 2), (6, 2), (6, 3)])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_pair_of_modes_much_closer_than_they_are_wide_is_told_apart(seed, n, d):
