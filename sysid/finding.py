@@ -101,12 +101,15 @@ class Finding(NamedTuple):
 
 
 def weightiest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings by severity, each once; those of one severity in the order in which they were found."""
+    """Findings by severity, each once; those of one severity in the order in which they were found.
+
+    Delays come first: they were taken off before all else was found.
+    """
     each: list[Finding] = []
     for finding in findings:
         if finding not in each:
             each.append(finding)
-    return tuple(sorted(each, key=lambda one: list(Severity).index(one.severity)))
+    return tuple(sorted(each, key=lambda one: (one.kind != "late sensor", list(Severity).index(one.severity))))
 
 
 def contradicting(findings: Iterable[Finding]) -> tuple[Finding, ...]:

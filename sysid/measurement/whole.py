@@ -136,15 +136,20 @@ class WholeRecords:
         return np.stack([1 / w**2, 1j / w])
 
     def pulses(self, last: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Times from an end, s, (k,), at which turned records hold what is not theirs, two in a period of `last`, Hz.
+        """Times from an end, s, (k,), at which turned records hold what is not theirs, for lines up to `last`, Hz.
 
-        And which sensors, and the force, do there, (n_sensors [+ 1], k). None where traces of sampling make up for it.
+        And which sensors, and the force, do there, (n_sensors [+ 1], k). So many as tell a signal in these lines that
+        is as long as the largest delay, by half periods, and two; none where traces of sampling make up for it.
         """
         taken = np.zeros(0) if self.taken is None else self.taken
-        ends = np.array([taken.max(initial=0.0), taken.min(initial=0.0)])
-        late, early = (np.arange(np.ceil(2 * last * abs(end) - 0.25)) + 0.5 for end in ends)
-        times = np.concatenate([late, -early]) / (2 * last)
-        return times, (taken[:, None] * times > 0) & (np.abs(times) < np.abs(taken[:, None]) + 1 / (4 * last))
+        times, spacing = [], []
+        for end in (taken.max(initial=0.0), taken.min(initial=0.0)):
+            periods = 2 * last * abs(end)
+            count = int(np.ceil(periods)) + 2 if periods > 0.25 else 0
+            times.append(end * (np.arange(count) + 0.5) / max(count, 1))
+            spacing.append(np.full(count, abs(end) / max(count, 1)))
+        at, width = np.concatenate(times), np.concatenate(spacing)
+        return at, (taken[:, None] * at > 0) & (np.abs(at) < np.abs(taken[:, None]) + width / 2)
 
     def to_tree(self) -> dict[str, Any]:
         """Give it as dictionaries and arrays; `from_tree` takes it back."""

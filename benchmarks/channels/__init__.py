@@ -1,0 +1,1 @@
+"""What channels record in the place of the structure's motion: late ones."""
