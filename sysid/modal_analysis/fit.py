@@ -92,7 +92,7 @@ def _on_one_clock(test: Measurement, delays: Array, monitor: FitMonitor, rounds:
         left = delays_left(fit)
         if left is None:
             break
-        monitor.doing, total = "delays", delays + left.values
+        monitor.doing, total = "delays", delays + left
         turned = without_delays(test, total)
         if np.any((total != 0) & (delays == 0)):
             trial = _whole_fit(turned, monitor)

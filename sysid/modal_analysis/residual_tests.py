@@ -330,22 +330,37 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     return step / size[asked].reshape(n, d), chi2
 
 
-def delays_left(fit: RecordFit) -> Delays | None:
-    """Delays of sensors and force that a step of all unknowns from the end of a fit finds beyond chance, or None."""
+def delays_left(fit: RecordFit, near: float = 0.3) -> Array | None:
+    """Delays of sensors and force that a step of all unknowns from the end of a fit finds beyond chance, s, or None.
+
+    Those that were taken off already move too, where they are off by more than `near` of their deviation.
+    """
     step, covariance = _delays(fit, np.eye(fit.asked.size - fit.asked.delays))
     told = np.flatnonzero(np.diag(covariance))
     found = beyond_noise(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
-    return found and found.at(told, step.size)
+    if found is not None:
+        return found.at(told, step.size).values
+    late, _ = _taken(fit)
+    more, covariance = _delays(fit, late)
+    return late @ more if np.any(np.abs(more) > near * np.sqrt(np.diag(covariance))) else None
 
 
 def delays_of(fit: RecordFit) -> Delays:
     """Delays that were taken off the records of a fit, with their errors at its end."""
+    late, of_base = _taken(fit)
     taken = fit.model.whole.taken
     if taken is None:
         return Delays.none(fit.test)
-    of_base = taken.size > 1 and bool(np.all(taken == taken[0]))
-    late = np.ones((taken.size, 1)) if of_base else np.eye(taken.size)[:, taken != 0]
     return Delays(taken, late @ np.sqrt(np.diag(_delays(fit, late)[1])), of_base)
+
+
+def _taken(fit: RecordFit) -> tuple[Array, bool]:
+    """Columns (k, q) of delays that were taken off, one of all that are the base's; and whether they are."""
+    taken = fit.model.whole.taken
+    if taken is None:
+        return np.zeros((fit.asked.size - fit.asked.delays, 0)), False
+    of_base = taken.size > 1 and bool(np.all(taken == taken[0]))
+    return np.ones((taken.size, 1)) if of_base else np.eye(taken.size)[:, taken != 0], of_base
 
 
 def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
