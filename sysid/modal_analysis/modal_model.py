@@ -86,8 +86,8 @@ class Parameters:
     traces: Array
     coupling: Array | None = None
 
-    def at(self, kept: NDArray[np.bool_]) -> Parameters:
-        """Those of some of the modes, (m,)."""
+    def at(self, kept: NDArray[Any]) -> Parameters:
+        """Those of some of the modes, by flags (m,) or numbers."""
         coupling = None if self.coupling is None else self.coupling[np.ix_(kept, kept)]
         return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling)
 
