@@ -13,9 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.jacobian_columns import Columns, Layer, Moves, Summed, Sums
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
+from sysid.modal_analysis.modal_model import (
+    FAR,
+    Columns,
+    Layer,
+    Lines,
+    Moves,
+    NormalEquations,
+    Parameters,
+    Run,
+    SpectralModel,
+    Summed,
+    Sums,
+    dots,
+)
 from sysid.modal_analysis.response import modes_above, real_times
 from sysid.structure.structure import Array, ComplexArray
 
