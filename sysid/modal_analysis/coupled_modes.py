@@ -78,9 +78,11 @@ def with_couplings(
         return fit
     # Beside what a wrong gain or modes above the lines make, which couplings would mimic.
     model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True)
-    beyond = max(fit.reduced, 1.0)
-    promised, count = score_of_couplings(model, model.normal_equations(p, fit.levels))
-    if promised < beyond * beyond_chance(count):
+    beyond, equations = max(fit.reduced, 1.0), model.normal_equations(p, fit.levels)
+    promised, count = score_of_couplings(model, equations)
+    above = np.arange(model.size) >= model.n_fit + model.n * model.d
+    # What modes above the lines leave would pass for couplings of those that stand for them.
+    if promised < max(beyond * beyond_chance(count), score(equations, above)[0]):
         return fit
     first = replace(p, coupling=np.zeros((m, m)))
     monitor.doing = f"{m} modes and the dampers between them"

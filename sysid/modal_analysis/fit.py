@@ -141,7 +141,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):
-        fit = max(fit, _fitted(test, again, monitor), key=lambda one: one.schwarz)
+        fit = max(fit, _fitted(test, again, monitor, beside=fit), key=lambda one: one.schwarz)
     return _with_all_modes(fit, monitor)
 
 
@@ -157,16 +157,21 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
     return fit
 
 
-def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
-    """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors."""
+def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
+    """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors.
+
+    Where a few steps lead to the modes of the fit `beside`, it is the same.
+    """
     monitor.doing = f"{poles.omega.size} modes"
     fit = _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
+    if beside is not None and beside.settled and _same_modes(beside.parameters.modes, fit.parameters.modes):
+        return beside
     fit = _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
     return fit
 
 
-def _same_modes(modes: Modes, poles: Poles) -> bool:
+def _same_modes(modes: Modes, poles: Poles | Modes) -> bool:
     """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
     if modes.omega.size != poles.omega.size:
         return False

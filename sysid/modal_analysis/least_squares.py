@@ -29,6 +29,8 @@ class SumOfSquares:
         Normal equations at parameters, by the unknowns.
     renewed : callable
         The same where their matrix was that of other parameters close by, else None: asked for where a step fails.
+    moved : callable
+        Unknowns after a step: to first order their sum.
     """
 
     start: Array
@@ -36,6 +38,7 @@ class SumOfSquares:
     chi2: Callable[[Parameters], float]
     equations: Callable[[Parameters], NormalEquations]
     renewed: Callable[[Parameters], NormalEquations | None] = lambda _: None
+    moved: Callable[[Array, Array], Array] = np.add
 
 
 def minimise(
@@ -69,7 +72,8 @@ def minimise(
             scaled = here.normal * np.outer(unit, unit)
             step = _step(scaled, damping, here.gradient * unit) * unit
             promised = float(here.gradient @ step)
-            trial = problem.unpack(x + step)
+            there = problem.moved(x, step)
+            trial = problem.unpack(there)
             after = problem.chi2(trial)
             if after <= here.chi2 or promised < enough:
                 break
@@ -81,7 +85,7 @@ def minimise(
                 return p, here.chi2, False
         if after > here.chi2:
             return p, here.chi2, True
-        x, p = np.asarray(x + step), trial
+        x, p = there, trial
         damping = max(damping / 10, least)
         if promised < enough:
             return p, after, True

@@ -134,7 +134,29 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     gained = 2 * (more.likelihood - fit.likelihood)
     if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
-    return _in_gauge(more)
+    return _in_gauge(_with_poles_above(more, monitor))
+
+
+def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
+    """The fit with further poles between the last line and its static modes, by Akaike's criterion: they are no modes.
+
+    See `ModeFit.with_static` of spectra.
+    """
+    last, far = 2 * np.pi * fit.test.freq[-1] * np.array([1.0, STATIC_POLE[0]])
+    monitor.doing = "poles above the lines"
+    while True:
+        m = fit.model.m
+        price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
+        peak = next((one for one in peaks_of(fit, price) if last < one.omega < far), None)
+        if peak is None:
+            return fit
+        before_static = np.insert(np.arange(m), m - fit.static, m)
+        more = refitted(fit, _with(fit, fit.parameters, peak).at(before_static), monitor=monitor)
+        omega = more.parameters.modes.omega[: -fit.static]
+        stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
+        if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):
+            return fit
+        fit = more
 
 
 def _rise(fit: RecordFit) -> tuple[float, Array]:
@@ -231,9 +253,9 @@ def _outer(rows: Array) -> Array:
 def trials_of(fit: RecordFit, at_once: int = 16) -> Trials:
     """Trial poles at all frequencies of the lines, in steps of half a half-power width, of three damping ratios.
 
-    So many at once: neighbours have nearly the same lines.
+    So many at once: neighbours have nearly the same lines. Beside static modes, up to these.
     """
-    ends = 2 * np.pi * fit.test.freq[[0, -1]]
+    ends = 2 * np.pi * fit.test.freq[[0, -1]] * [1.0, STATIC_POLE[0] if fit.static else 1.0]
     trials = [np.geomspace(ends[0], ends[1], int(np.log(ends[1] / ends[0]) / ratio) + 2) for ratio in _RATIOS]
     omega, ratios = np.concatenate(trials), np.repeat(_RATIOS, [one.size for one in trials])
     model, K = fit.model, omega.size

@@ -315,7 +315,7 @@ def _minimise(
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
-        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels),
+        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
     )  # fmt: skip
     return minimise(problem, tell, most, lambda _: _SETTLED)
 

@@ -8,76 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import FAR, Lines, NormalEquations, Parameters, Run, SpectralModel, dots
+from sysid.modal_analysis.modal_model import (
+    FAR,
+    Columns,
+    Layer,
+    Lines,
+    Moves,
+    NormalEquations,
+    Parameters,
+    Run,
+    SpectralModel,
+    Summed,
+    Sums,
+    dots,
+)
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 
 _TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
 KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
-
-
-class Layer(NamedTuple):
-    """One entry of each of some columns of a Jacobian: ``values[:, channel] * spectra[spectrum]``, (k,) and (k, c)."""
-
-    column: NDArray[np.intp]
-    spectrum: NDArray[np.intp]
-    values: Array
-
-
-class Columns(NamedTuple):
-    """Columns of a run's Jacobian by its spectra, each the sum of its entries in all layers.
-
-    `unknowns` (k,) are those that show in this run. The first layer has an entry of each.
-    """
-
-    unknowns: NDArray[np.intp]
-    layers: list[Layer]
-
-    def seen(self, weights: ComplexArray, spectra: ComplexArray) -> ComplexArray:
-        """Sums of all columns (k, L) over the channels, with weights (c, L)."""
-        first, *others = self.layers
-        out = real_times(first.values, weights)
-        out *= spectra[first.spectrum]
-        for column, spectrum, values in others:
-            out[column] += real_times(values, weights) * spectra[spectrum]
-        return out
-
-    def products(self, sums: Sums, scale: Array) -> NormalEquations:
-        """Products of the Jacobian from those of its spectra, for outputs of these inverse deviations, (c,)."""
-        normal, gradient = -sums.hidden, np.zeros(self.unknowns.size)
-        for column, spectrum, values in self.layers:
-            gradient[column] += np.sum(values * sums.cross[spectrum], axis=1)
-            if normal.size == 0:
-                continue
-            for other, beside, theirs in self.layers:
-                normal[np.ix_(column, other)] += (scale**2 * values) @ theirs.T * sums.gram[np.ix_(spectrum, beside)]
-        return NormalEquations(normal, gradient, sums.chi2)
-
-
-class Sums(NamedTuple):
-    """Products over some lines of a run, of which those of the Jacobian are made.
-
-    Of its spectra (s, s), of these with errors by their covariance (s, c), of what the noise of the base hides of the
-    columns (k, k), and ``e' S^-1 e``; the first and the third are empty where only a gradient is asked for.
-    """
-
-    gram: Array
-    cross: Array
-    hidden: Array
-    chi2: float
-
-    def plus(self, other: Sums) -> Sums:
-        """Those of the lines of both."""
-        return Sums(
-            self.gram + other.gram, self.cross + other.cross, self.hidden + other.hidden, self.chi2 + other.chi2
-        )  # fmt: skip
 
 
 class RecordModel(SpectralModel):
@@ -201,6 +156,22 @@ class RecordModel(SpectralModel):
             coupling = coupling + coupling.T if self.force else coupling
         return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape), coupling)
 
+    def moved(self, x: Array, step: Array, most: float = 1.0) -> Array:
+        """Unknowns after a step, to first order their sum: a mode's scale, shape against load, changes by a factor.
+
+        Only the force tells a scale, which a light mode has hardly any of, while sums would change large motions by the
+        product of both moves. `most` is of the logarithm of a factor.
+        """
+        index, m = self.index, self.m
+        phi, moves = (one[index.phi].reshape(self.n, m).T for one in (x, step))
+        gamma, turns = (one[index.gamma].reshape(m, self.d) for one in (x, step))
+        grown = [np.sum(a * b, axis=1) / np.sum(a**2 + 1e-300, axis=1) for a, b in ((phi, moves), (gamma, turns))]
+        scale, by = np.clip((grown[0] - grown[1]) / 2, -most, most), np.zeros(self.size)
+        by[index.phi] = np.tile(scale, self.n)
+        by[index.gamma] = -np.repeat(scale, self.d)
+        by[self.kept : self.kept + self.n_ends] = -np.repeat(scale, self.n_ends // m)
+        return np.asarray(np.exp(by) * (x + step - by * x))
+
     @property
     def unknowns(self) -> int:
         """Numbers that the records determine: without a force the scale of each mode is none."""
@@ -232,11 +203,11 @@ class RecordModel(SpectralModel):
 
         `levels` are variances of a sample in time, of the outputs and then of the base, (pieces, c + d).
         """
-        return self._products(p, levels, Chunk.sums)
+        return self._products(p, levels, lambda chunk, *given: chunk.sums(*given))
 
     def gradient(self, p: Parameters, levels: Array) -> NormalEquations:
         """The same without the normal matrix, which stays zero: several times as fast."""
-        return self._products(p, levels, Chunk.sums_of_errors)
+        return self._products(p, levels, lambda chunk, *given: chunk.sums_of_errors(*given))
 
     def _products(self, p: Parameters, levels: Array, each: Callable[[Chunk, Array, Columns], Sums]) -> NormalEquations:
         normal, gradient, chi2 = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
@@ -395,51 +366,86 @@ class Chunk(Lines):
 
 
 class CoupledChunk(Chunk):
-    """The same of modes that dampers couple: each load moves all of them."""
+    """The same of modes that dampers couple: each load moves all of them.
 
-    def spectra(self, base: ComplexArray) -> ComplexArray:
-        """Motions; those of each mode by each load of the base; slopes by poles, base; couplings; ends; traces, gains.
+    With A the flexibility, a change D of what it is the inverse of moves the motions q by ``-A D q``. So a column of a
+    load, a pole or a coupling is a spectrum times the responses of all channels to a load of one mode, (c, L), those of
+    ``shapes @ A``; or the sum of two such. Other columns show in a few channels, and are spectra there.
+    """
 
-        With A the flexibility, a change D of what it is the inverse of moves the motions q by ``-A D q``.
-        """
-        modes, A, w, size = self.p.modes, self.flexibility, self.run.w, base.shape[1]
-        w_a = w**2 * A
-        q = np.einsum("jkl,kl->jl", w_a, real_times(modes.gamma, base) + self.pushed_by_ends)
-        loss = 2j * (modes.ratios * modes.omega)[:, None] * w
-        slopes = [A * (-by * q) for by in (2 * modes.omega[:, None] ** 2 + loss, loss)]
-        one, other = self.records.coupled.T
-        turned = A[:, one] * q[other]
-        if self.records.force:
-            turned += A[:, other] * q[one]
-        parts = [q, w_a[:, :, None] * base, *slopes, base, -1j * w * turned]
-        if self.at_ends is not None:
-            parts.append(w_a[:, :, None] * self.transients)
-        parts.append(self.trace_spectra)
-        if self.records.gains:
-            parts.append(self.beside_the_fit(base))
-        return np.concatenate([part.reshape(-1, size) for part in parts])
-
-    def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+    def columns(self) -> Columns:
         """See `Chunk`."""
-        model = self.records
-        m, d, index, k = model.m, model.d, model.index, np.arange(model.m)
-        shapes, pairs = self.shapes[channel], len(model.coupled)
-        sizes = [m, m * m * d, m * m, m * m, d, m * pairs]
-        first = np.cumsum([0, *sizes])
-        yield from self.of_motion(channel, int(first[4]))
-        rows = [
-            index.gamma.start + np.arange(m * d), index.log_omega.start + k, index.log_ratios.start + k,
-            model.coupling.start + np.arange(pairs),
-        ]  # fmt: skip
-        starts, last = [first[1], first[2], first[3], first[5]], first[6]
+        return Summed(np.arange(self.records.size), [])
+
+    def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
+        """See `Chunk`."""
+        weighed, none = self.weighed(levels), np.zeros((0, 0))
+        weights = (self.run.weight * weighed.whitened_residual).conj()
+        gradient = self._seen(weights, *self._parts(weighed.base)).real.sum(axis=1)
+        return Sums(none, gradient, none, float(self.run.weight @ weighed.power))
+
+    def sums(self, levels: Array, columns: Columns) -> Sums:
+        """See `Chunk`."""
+        scale, root = self.deviations(levels)[0], np.sqrt(self.run.weight)
+        moves, alone = self._parts(self.weighed(levels).base)
+        normal = np.zeros((self.records.size,) * 2)
+        for channel, shape in enumerate(self.shapes):
+            rows, spectra = self._of_channel(channel, alone)
+            at = np.union1d(moves[0].unknowns, rows)
+            J = np.zeros((at.size, root.size), complex)
+            self._add(J, np.einsum("k,kjl->jl", shape, self.flexibility), moves, at)
+            J[np.searchsorted(at, rows)] += spectra
+            J *= scale[channel] * root
+            normal[np.ix_(at, at)] += dots(J, J)
+        for part in self.covered(levels):
+            seen = self._seen(root * part.conj(), moves, alone)
+            normal -= dots(seen, seen)
+        return self.sums_of_errors(levels, columns)._replace(gram=normal)
+
+    def _parts(self, base: ComplexArray) -> tuple[list[Moves], ComplexArray]:
+        """Columns that all channels feel; spectra of those of one: of modes, base, traces, and of modes above."""
+        model, modes, w, k = self.records, self.p.modes, self.run.w, np.arange(self.records.m)
+        d, index, (one, other) = model.d, model.index, model.coupled.T
+        q = self.answer(real_times(modes.gamma, base) + self.pushed_by_ends)
+        loss = 2j * (modes.ratios * modes.omega)[:, None] * w
+        rows = [np.arange(index.gamma.start, index.log_ratios.stop), np.r_[model.coupling]]
+        acting = [np.repeat(k, d), k, k, one]
+        loads = [np.tile(w**2 * base, (k.size, 1)), -(2 * modes.omega[:, None] ** 2 + loss) * q, -loss * q]
+        loads.append(-1j * w * q[other])
+        alone = [q, base, self.trace_spectra]
         if self.at_ends is not None:
             runs = 2 * len(model.moving)
             rows.append((model.kept + k[:, None] * runs + self.at_ends.start + np.arange(2)).ravel())
-            starts, last = [*starts, last], last + 2 * m * m
-        for row, start in zip(rows, starts, strict=True):
-            spectra = start + np.arange(m * row.size)
-            yield np.tile(row, m), spectra, np.repeat(shapes, row.size)
-        yield from self.of_sensor(channel, int(first[4]), int(last))
+            acting.append(np.repeat(k, 2))
+            loads.append(np.tile(w**2 * self.transients, (k.size, 1)))
+        if model.gains:
+            alone.append(self.beside_the_fit(base))
+        moves = [Moves(*map(np.concatenate, (rows, acting, loads)))]
+        if model.force:
+            moves.append(Moves(np.r_[model.coupling], other, -1j * w * q[one]))
+        return moves, np.concatenate(alone)
+
+    def _of_channel(self, channel: int, alone: ComplexArray) -> tuple[NDArray[np.intp], ComplexArray]:
+        """Unknowns (k,) that show in a channel beside what all of them feel, and their columns there."""
+        m = self.records.m
+        entries = [*self.of_motion(channel, m), *self.of_sensor(channel, m, m + self.records.d)]
+        return np.concatenate([one[0] for one in entries]), alone[np.concatenate([one[1] for one in entries])]
+
+    def _seen(self, weights: ComplexArray, moves: list[Moves], alone: ComplexArray) -> ComplexArray:
+        """Sums of all columns (size, L) over the channels, with weights (c, L)."""
+        out = np.zeros((self.records.size, self.run.w.size), complex)
+        felt = np.einsum("kl,kjl->jl", real_times(self.shapes.T, weights), self.flexibility)
+        self._add(out, felt, moves, np.arange(self.records.size))
+        for channel, weight in enumerate(weights):
+            rows, spectra = self._of_channel(channel, alone)
+            out[rows] += weight * spectra
+        return out
+
+    @staticmethod
+    def _add(out: ComplexArray, felt: ComplexArray, moves: list[Moves], at: NDArray[np.intp]) -> None:
+        """Add columns that all channels feel to rows of the unknowns `at`; `felt` (m, L) is what loads of modes do."""
+        for unknowns, acting, loads in moves:
+            out[np.searchsorted(at, unknowns)] += felt[acting] * loads
 
 
 def trace_count(test: Measurement) -> int:

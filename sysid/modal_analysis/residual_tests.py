@@ -287,6 +287,9 @@ def gain_errors_of(fit: RecordFit) -> Gains:
 
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
     better known of both is taken. Motion with the base in any of its directions is asked for beside that part.
+
+    Poles above the lines stand for more modes than there are of them: the part that these leave is asked for then, as
+    where both agree by chance the first would pass for exact.
     """
     equations, G = fit.equations.at(slice(fit.asked.delays)), fit.test.rigid_body
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
@@ -303,7 +306,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
 
     (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
     plain_std = np.hypot(plain_std, plain - error)
-    better = plain_std < std
+    better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
     # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
     # linear in it take the factor, and G u beside them pulls the fit.
     half = half_inverse(normal[:at, :at], ROUND_OFF)

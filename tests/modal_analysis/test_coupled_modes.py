@@ -1,6 +1,7 @@
 """Modes that dampers couple: responses against direct solves, poles of the state matrix, first order, fits."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.response import coupled_flexibility
 
 RATE, LINES = 64.0, (0.5, 16.0)
@@ -115,6 +117,61 @@ def test_slopes_of_plain_spectra_are_those_of_differences():
 def estimated():
     """Give a function that fits modes to a record with a dashpot, N s/m, once."""
     return functools.cache(lambda dashpot: fit_modes(record(building(dashpot), 0.005, np.random.default_rng(3))))
+
+
+def beside(truth, model):
+    """Parameters near the truth's, with motion at the ends of the run."""
+    modes, coupling = modes_of(truth)
+    ends = np.random.default_rng(1).uniform(0.5, 1.0, (3, 2))
+    p = Parameters(modes, truth.rigid_body_mass, ends, np.zeros((1, model.channels, 3)), coupling)
+    return model.unpack(model.pack(p) * np.random.default_rng(2).uniform(0.97, 1.03, model.size))
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_the_normal_matrix_of_whole_records_is_half_the_curvature_where_nothing_is_left(force):
+    truth = building()
+    test = record(truth, 0.005, np.random.default_rng(3), samples=600, force=force)
+    model = RecordModel(test, 3, coupled=True)
+    p = beside(truth, model)
+    model.runs = [chunk.run._replace(outputs=chunk.run.outputs - chunk.error) for chunk in model.chunks(p)]
+    levels = np.random.default_rng(4).uniform(0.5, 2.0, (1, model.channels + 1))
+    normal, x = model.normal_equations(p, levels).normal, model.pack(p)
+    for v in np.random.default_rng(5).standard_normal((20, x.size)):
+        step = 1e-4 * v / np.sqrt(np.diag(normal))
+        rise = [model.chi2(model.unpack(x + sign * step), levels) for sign in (1, -1)]
+        assert sum(rise) / 2 == pytest.approx(step @ normal @ step, rel=1e-3)
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_modes_that_no_damper_couples_have_the_same_equations_by_either_way(force):
+    """Those with couplings of zero, of gains and of modes above the lines too."""
+    truth = building(0.0)
+    test = record(truth, 0.005, np.random.default_rng(3), samples=600, force=force)
+    model = RecordModel(test, 3, coupled=True, gains=True)
+    p = beside(truth, RecordModel(test, 3, coupled=True))
+    levels = np.random.default_rng(4).uniform(0.5, 2.0, (1, model.channels + 1))
+    one, other = (model.normal_equations(replace(p, coupling=it), levels) for it in (None, np.zeros((3, 3))))
+    size = np.sqrt(np.diag(one.normal))
+    assert np.all(size > 0)
+    np.testing.assert_allclose(other.normal / np.outer(size, size), one.normal / np.outer(size, size), atol=1e-10)
+    np.testing.assert_allclose(other.gradient / size, one.gradient / size, atol=1e-8)
+    assert other.chi2 == pytest.approx(one.chi2, rel=1e-12)
+    np.testing.assert_allclose(model.gradient(replace(p, coupling=np.zeros((3, 3))), levels).gradient, other.gradient)
+
+
+def test_steps_along_the_scale_of_a_mode_change_no_motion_and_others_are_sums_to_first_order():
+    truth = building(0.0)
+    test = record(truth, 0.005, np.random.default_rng(3), samples=600, force=False)
+    model = RecordModel(test, 3)
+    p = replace(beside(truth, RecordModel(test, 3, coupled=True)), coupling=None)
+    levels, x = np.ones((1, model.channels + 1)), model.pack(p)
+    for along in model.scales(p):
+        there = model.moved(x, 0.7 * along)
+        assert np.linalg.norm(there - x) > 0.5 * np.linalg.norm(along)
+        assert model.chi2(model.unpack(there), levels) == pytest.approx(model.chi2(p, levels), rel=1e-10)
+    step = x * np.random.default_rng(6).uniform(-1, 1, x.size)
+    off = [np.abs(model.moved(x, size * step) - x - size * step).max() for size in (1e-3, 1e-4)]
+    assert 0 < off[1] < 0.02 * off[0]
 
 
 @pytest.mark.parametrize("dashpot", [0.0, 2.0, 25.0])

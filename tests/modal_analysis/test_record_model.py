@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.modal_fit import Modes
@@ -186,7 +187,7 @@ def test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_l
     """
     model, p, levels = _model(False, d)
     n, fit = model.n, RecordModel(model.test, 2, gains=True)
-    gradient = fit.normal_equations(p, levels).gradient[fit.n_fit :].reshape(3, n, d)
+    gradient = fit.normal_equations(p, levels).gradient[fit.n_fit : fit.delays].reshape(3, n, d)
     h, last, far = 1e-5, 2 * np.pi * model.test.freq[-1], 1e4
     more = RecordModel(model.test, 4)
 
@@ -206,6 +207,22 @@ def test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_l
         for kind, step in enumerate(h * np.eye(3)):
             slope = (left(i, j, *step) - left(i, j, *-step)) / (2 * h)
             assert -2 * gradient[kind, i, j] == pytest.approx(slope, rel=1e-4, abs=1e-4 * np.abs(gradient).max())
+
+
+@CASES
+def test_columns_of_delays_are_what_turned_outputs_lose(force: bool, d: int, coupled: bool) -> None:
+    """A sensor, or the force in all its directions, that is earlier by h is missed by as much as one late by -h."""
+    model, p, levels = _model(force, d, coupled)
+    fit = RecordModel(model.test, model.m, gains=True, coupled=coupled)
+    gradient, size, h = fit.normal_equations(p, levels).gradient[fit.delays :], model.n + force, 1e-6
+    assert gradient.shape == (size,)
+    for channel in range(size):
+        chi2 = []
+        for delay in (h, -h):
+            model.test = without_delays(fit.test, delay * np.eye(size)[channel])
+            chi2.append(RecordModel(model.test, model.m, coupled=coupled).chi2(p, levels))
+        slope = (chi2[0] - chi2[1]) / (2 * h)
+        assert 2 * gradient[channel] == pytest.approx(-slope, rel=1e-4, abs=1e-5 * np.abs(gradient).max())
 
 
 @CASES
