@@ -167,7 +167,10 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
             other = _settled(_Late.on(still, clocks, far, at.at.poles))
             end = other if other.explains_more_than(end) else end
     if complex_.explains_more_than(end):
+        complex_ = _settled(complex_, held=True)
         end = _settled(complex_)
+        if not end.explains_more_than(complex_):
+            return none
     return _found(end, test) or none
 
 
@@ -218,7 +221,7 @@ class _Late:
         square = (test.freq / test.freq[-1]) ** 2
         direct = records.basis(np.stack([np.ones_like(square), square]) + 0j, records.driven)
         functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
-        direct = np.hstack([direct, _ends_of_turned(test, records)])
+        direct = np.hstack([direct, _of_runs(test, records)])
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
         answered = self.basis.answers(records.data)
         self.left = records.data - self.basis.times(answered)
@@ -287,9 +290,15 @@ class _Late:
         """The channels without their delays."""
         return without_delays(self.still, self.delays[self.clocks])
 
-    def step(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """A damped step of poles and delays, and the covariance of the latter; zero for those that nothing tells."""
+    def step(self, damping: float = 0.0, *, held: bool = False) -> tuple[Array, Array, Array]:
+        """A damped step of poles and delays, and the covariance of the latter; zero for those that nothing tells.
+
+        Of `held` delays as well.
+        """
         normal, descent = self.equations
+        if held:
+            free = np.arange(descent.size) < self.poles.size
+            normal, descent = normal * np.outer(free, free), descent * free
         unit = units_of(normal)
         values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + damping * np.eye(unit.size))
         root = unit[:, None] * vectors / np.sqrt(np.maximum(values, ROUND_OFF * values[-1]))
@@ -303,28 +312,36 @@ class _Late:
         return float(delays @ np.linalg.pinv(covariance, hermitian=True) @ delays)
 
 
-def _ends_of_turned(test: Measurement, records: Records) -> Array:
-    """Columns of what turned records of each run hold that is not theirs, (rows, k)."""
+def _of_runs(test: Measurement, records: Records) -> Array:
+    """Columns of what each run of whole records holds beside its response, (rows, k).
+
+    The traces of sampling, and what turned records hold at an end that is not theirs: see `RecordModel`.
+    """
     if test.whole is None:
         return np.zeros((len(records.data), 0))
     weight = factors_of_runs(test.response_std, test.response.shape)[1][records.run, records.line]
-    times, _ = test.whole.pulses(test.freq[-1])
-    pulses = weight * np.exp(2j * np.pi * np.multiply.outer(times, test.freq[records.line]))
-    by_run = [np.where(records.run == run, pulses, 0.0) for run in test.whole.moving]
-    return stacked(np.concatenate([pulses[:0], *by_run]))
+    freq, (times, _) = test.freq[records.line], test.whole.pulses(test.freq[-1])
+    x = freq / test.freq[-1]
+    traces = np.concatenate([[np.ones_like(x), 1j * x, -1j / x], np.exp(2j * np.pi * np.multiply.outer(times, freq))])
+    return stacked(np.concatenate([np.where(records.run == run, weight * traces, 0.0) for run in range(test.n_runs)]))
 
 
-def _settled(best: _Late, steps: int = 15, near: float = 0.05) -> _Late:
-    """The fit after Levenberg-Marquardt steps, until one would move no delay by so small a part of its deviation."""
+def _settled(best: _Late, steps: int = 15, near: float = 0.05, *, held: bool = False) -> _Late:
+    """The fit after Levenberg-Marquardt steps, until one moves no delay by more than a small part of its deviation.
+
+    Where delays are `held`, until one gains next to nothing.
+    """
     damping = 1e-3
     for _ in range(steps):
-        poles, delays, covariance = best.step(damping)
+        poles, delays, covariance = best.step(damping, held=held)
         trial = best.moved(poles, delays)
-        if np.sum(np.log(trial.level)) > np.sum(np.log(best.level)):
+        gained = float(np.sum(np.log(best.level / trial.level)))
+        if gained < 0:
             damping *= 10
             continue
         best, damping = trial, max(damping / 10, ROUND_OFF)
-        if np.all(np.abs(delays) <= near * np.sqrt(np.diag(covariance))):
+        small = gained < near / len(best.left) if held else np.abs(delays) <= near * np.sqrt(np.diag(covariance))
+        if np.all(small):
             break
     return best
 
