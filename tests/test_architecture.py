@@ -40,8 +40,8 @@ CEILINGS = {
     # and modes that dampers couple, in spectra and whole records, with C and its deviations (631),
     # and the rank of the base mass and poles close above the lines (135),
     # and columns of coupled modes channel by channel, scales of modes that move by factors, and poles close above the
-    # lines of whole records (108),
-    "lines": 42_744,
+    # lines of whole records (111),
+    "lines": 42_747,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

@@ -160,12 +160,15 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
 def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
     """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors.
 
-    Where a few steps lead to the modes of the fit `beside`, it is the same.
+    Where a few steps lead to the modes of the fit `beside` within the lines, and to as many, it is the same: poles
+    beyond the lines, which hardly show, move until the end.
     """
     monitor.doing = f"{poles.omega.size} modes"
     fit = _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
-    if beside is not None and beside.settled and _same_modes(beside.parameters.modes, fit.parameters.modes):
-        return beside
+    if beside is not None and beside.settled and beside.model.m == fit.model.m and beside.schwarz >= fit.schwarz:
+        last = 2 * np.pi * test.freq[-1]
+        if _same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
+            return beside
     fit = _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
     return fit
@@ -176,7 +179,7 @@ def _same_modes(modes: Modes, poles: Poles | Modes) -> bool:
     if modes.omega.size != poles.omega.size:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
-    return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
+    return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
 
 
 def _pruned(fit: RecordFit, monitor: FitMonitor, *, limits: Limits = WHOLE) -> RecordFit:
