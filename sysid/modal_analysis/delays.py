@@ -114,7 +114,7 @@ class Clock:
             return cls(given, Delays.none(given), None)
 
 
-def beyond_noise(values: Array, covariance: Array, least: float) -> Delays | None:
+def delays_beyond_chance(values: Array, covariance: Array, least: float) -> Delays | None:
     """The fewest delays that explain what was found, with this covariance; None where chance or nothing does.
 
     One of the base is tried first, then as few channels as leave the others to chance. Delays below `least` are none.
@@ -351,7 +351,7 @@ def _found(end: _Late, test: Measurement) -> Delays | None:
     shown = np.diag(end.equations[0])[end.poles.size :] > 0
     told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
     covariance = end.step()[2][np.ix_(told, told)]
-    found = beyond_noise(end.delays[told], covariance, least_delay(test))
+    found = delays_beyond_chance(end.delays[told], covariance, least_delay(test))
     return found and found.at(told, end.delays.size)
 
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.modal_analysis.modal_model import base_noise, dots
-from sysid.modal_analysis.record_model import Parameters, RecordModel, designs
+from sysid.modal_analysis.record_model import Parameters, RecordModel
+from sysid.modal_analysis.varying_levels import designs
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE
 

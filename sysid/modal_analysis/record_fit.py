@@ -27,10 +27,10 @@ from sysid.modal_analysis.record_model import (
     NormalEquations,
     Parameters,
     RecordModel,
-    extra_numbers,
     trace_count,
 )
 from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.varying_levels import extra_numbers
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.modal_analysis.delays import Delays, beyond_noise, least_delay
+from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
@@ -340,7 +340,7 @@ def delays_left(fit: RecordFit, near: float = 0.3) -> Array | None:
     """
     step, covariance = _delays(fit, np.eye(fit.asked.size - fit.asked.delays))
     told = np.flatnonzero(np.diag(covariance))
-    found = beyond_noise(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
+    found = delays_beyond_chance(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
     if found is not None:
         return found.at(told, step.size).values
     late, _ = _taken(fit)

@@ -9,7 +9,7 @@ from scipy.optimize import approx_fprime
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
-from sysid.modal_analysis.record_model import KNOTS, designs, segments
+from sysid.modal_analysis.varying_levels import KNOTS, designs, segments
 
 SETTING = four_storeys()
 RISE = 5.0
