@@ -1,0 +1,179 @@
+"""Delays of channels: exact ones of spectra and of records cut in motion, none on one clock, slopes, what is stored."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.records.simulated import Records, Run, four_storeys
+from sysid.measurement.clocks import without_delays
+from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
+from sysid.modal_analysis.direct_terms import beside_poles
+from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.residual_tests import delays_left, delays_of
+
+SETTING = replace(four_storeys(150.0), duration=60.0)
+FREQ = np.linspace(1.3, 16.0, 300)
+MS = 1e-3
+
+
+def spectra(delays, seed=0, noise=0.01):
+    """Unit runs of the storeys, channels late by so much, s: of the sensors, then of the force."""
+    clean = sysid.simulate(SETTING.structure, FREQ, force=True)
+    late = without_delays(clean, -np.asarray(delays))
+    rng, parts = np.random.default_rng(seed), {}
+    for name in ("response", "force"):
+        record = getattr(late, name)
+        std = noise * np.sqrt(np.mean(np.abs(record) ** 2, axis=2, keepdims=True))
+        real, imaginary = rng.standard_normal((2, *record.shape)) / np.sqrt(2)
+        parts |= {name: record + std * (real + 1j * imaginary), f"{name}_std": std}
+    return replace(late, **parts)
+
+
+def record(delays, seed=0):
+    """A record of the storeys, cut in motion, whose late channels are those of the same motion at earlier times."""
+    rng = np.random.default_rng(seed)
+    run = SETTING.run(rng)
+
+    def earlier(delay):
+        turned = run.motion.amplitudes * np.exp(-1j * run.motion.omega * delay)
+        motion = replace(run.motion, amplitudes=turned)
+        return Run(run.modes, motion, run.free * np.exp(-run.modes.poles * delay)).records()
+
+    *sensors, force = (earlier(delay) for delay in delays)
+    response = np.stack([part.response[i] for i, part in enumerate(sensors)])
+    late = Records(run.records().base, response, force.force, SETTING.sample_rate)
+    noisy, _ = SETTING.with_noise(late, rng)
+    return sysid.Measurement.from_time(
+        [(noisy.base, noisy.response, noisy.force)], SETTING.sample_rate, band=SETTING.lines,
+        rigid_body=SETTING.structure.rigid_body,
+    )  # fmt: skip
+
+
+LATE = [
+    [0, 2 * MS, 0, 0, 0], [0.5 * MS] * 5, [0, 0, 0, 0, -3 * MS], [0, 50 * MS, -50 * MS, 0, 30 * MS],
+    [0, 0, 0, 0, 140 * MS],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("delays", LATE)
+def test_delays_of_spectra_are_found_and_no_others(delays):
+    found = Clock.of(spectra(delays)).delays
+    np.testing.assert_array_equal(found.values != 0, np.array(delays) != 0)
+    late = found.values != 0
+    assert np.all(np.abs(found.values - delays)[late] < 4 * found.std[late])
+    assert found.of_base == (len(set(delays)) == 1)
+    assert found.of_base or np.all(found.std[~late] == 0)
+
+
+@pytest.mark.parametrize("delays", LATE[:4])
+def test_delays_of_records_cut_in_motion_are_found_with_the_modes(delays):
+    test = record(delays)
+    fit = whole_fit(test, Clock.of(test).delays.values)
+    found, late = delays_of(fit), np.array(delays) != 0
+    np.testing.assert_array_equal(found.values != 0, late)
+    assert np.all(np.abs(found.values - delays)[late] < 4 * found.std[late])
+    assert fit.parameters.modes.omega.size == 4
+    f = SETTING.structure.natural_frequencies
+    np.testing.assert_allclose(np.sort(fit.parameters.modes.omega) / (2 * np.pi), f, rtol=2e-3)
+    left = delays_left(fit)
+    assert left is None or np.all(np.abs(left) <= found.std)
+
+
+def test_a_fit_finds_the_delay_that_was_left_in():
+    test = record([0, 0.1 * MS, 0, 0, 0])
+    found = delays_of(whole_fit(test))
+    assert np.count_nonzero(found.values) == 1
+    assert abs(found.values[1] - 0.1 * MS) < 4 * found.std[1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_channels_on_one_clock_have_no_delay(seed):
+    for test in (spectra(np.zeros(5), seed), record(np.zeros(5), seed)):
+        clock = Clock.of(test)
+        assert not clock.delays
+        assert clock.test is test
+    assert delays_left(whole_fit(test)) is None
+
+
+def test_records_without_any_structure_have_no_delay():
+    rng = np.random.default_rng(6)
+    base, response = (rng.normal(size=(2, n, 40)) + 1j * rng.normal(size=(2, n, 40)) for n in (1, 3))
+    assert not Clock.of(sysid.Measurement(np.linspace(1, 12, 40), base, response, rigid_body=np.ones((3, 1)))).delays
+
+
+def test_a_channel_that_never_moves_is_left_alone():
+    test = spectra(LATE[0])
+    response, std = test.response.copy(), test.response_std.copy()
+    response[:, 3] = 0.0
+    found = Clock.of(replace(test, response=response, response_std=std)).delays
+    np.testing.assert_array_equal(np.flatnonzero(found.values), [1])
+
+
+@pytest.mark.parametrize("complex_residues", [False, True])
+@pytest.mark.parametrize("whole", [False, True])
+def test_descent_is_the_slope_of_what_is_left_with_residues_free(whole, complex_residues):
+    test = record(LATE[0]) if whole else spectra(LATE[0])
+    beside = beside_poles(test)
+    still, clocks, delays = _joined(beside.test), _clocks(test), 1e-4 * np.arange(5.0)
+    at = _Late.on(still, clocks, delays, beside.at.poles, complex_residues)
+    m, h = beside.at.poles.size, 1e-6
+
+    def left(poles, delays):
+        return np.sum((_Late.on(still, clocks, delays, poles, complex_residues).left / at.level) ** 2) / 2
+
+    for k in range(5):
+        step = h * np.eye(5)[k]
+        slope = (left(at.poles, delays + step) - left(at.poles, delays - step)) / (2 * h)
+        assert at.equations[1][m + k] == pytest.approx(-slope, rel=1e-4, abs=1e-6 * np.abs(at.equations[1][m:]).max())
+
+
+def test_one_delay_of_all_is_that_of_the_base_and_few_are_those_of_these():
+    covariance = 1e-10 * (np.eye(4) + 0.2)
+    alike = delays_beyond_chance(np.full(4, 5e-4), covariance, 0.0)
+    assert alike is not None
+    assert alike.of_base
+    np.testing.assert_allclose(alike.values, 5e-4)
+    np.testing.assert_allclose(alike.std, np.sqrt(1e-10 * (1 / 4 + 0.2)))
+    one = delays_beyond_chance(np.array([1e-5, 5e-4, -1e-5, 0.0]), covariance, 0.0)
+    assert one is not None
+    np.testing.assert_array_equal(np.flatnonzero(one.values), [1])
+    # Of the delay with the others held: regression on their errors.
+    others = [0, 2, 3]
+    carried = covariance[1, others] @ np.linalg.inv(covariance[np.ix_(others, others)])
+    assert one.values[1] == pytest.approx(5e-4 - carried @ [1e-5, -1e-5, 0.0])
+    assert one.std[1] == pytest.approx(np.sqrt(covariance[1, 1] - carried @ covariance[others, 1]))
+    assert delays_beyond_chance(np.full(4, 1e-6), covariance, 0.0) is None
+    assert delays_beyond_chance(np.full(4, 5e-4), covariance, 1e-3) is None
+
+
+@pytest.mark.parametrize("of_records", [False, True])
+def test_an_answer_tells_them_first_denies_nothing_and_is_stored_to_the_bit(of_records, tmp_path):
+    test = record(LATE[0]) if of_records else spectra(LATE[0])
+    result = sysid.identify(sysid.Problem(test), rng=0)
+    first = result.findings[0]
+    assert (first.kind, str(first.severity), first.channel) == ("late sensor", "note", "sensor 2")
+    assert abs(first.numbers["delay"] - 2 * MS) < 4 * first.numbers["std"]
+    assert result.determined
+    n = SETTING.structure.n
+    error = result.structure.mass[:n, :n] - SETTING.structure.mass[:n, :n]
+    assert np.all(np.abs(error) < 4.5 * result.uncertainty.mass[:n, :n])
+    result.save(tmp_path / "result.h5")
+    again = sysid.load(tmp_path / "result.h5")
+    np.testing.assert_array_equal(again.modal[0].delays.values, result.modal[0].delays.values)
+    np.testing.assert_array_equal(again.modal[0].delays.std, result.modal[0].delays.std)
+    np.testing.assert_array_equal(again.measurement.response, result.measurement.response)
+    assert again.findings == result.findings
+
+
+def test_stored_delays_of_another_test_are_refused():
+    tree = Delays.none(spectra(np.zeros(5))).to_tree()
+    with pytest.raises(sysid.InputError):
+        Delays.from_tree({**tree, "values": np.zeros(3)}, spectra(np.zeros(5)))
+    with pytest.raises(sysid.InputError):
+        Delays.from_tree({**tree, "std": np.full(5, np.nan)}, spectra(np.zeros(5)))
+
+
+def test_find_delays_without_poles_finds_none():
+    assert not find_delays(spectra(LATE[0]), None)
