@@ -214,14 +214,15 @@ def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> Stated
     """
     check_drawable(problem.stated)
     formulation, rng = problem.formulation, np.random.default_rng(random)
-    tests = iter(formulation.further_tests)
+    tests, modal = iter(formulation.further_tests), iter(problem.modal[1:])
     priors = iter(formulation.priors)
     residuals = []
     for given in problem.stated.residuals:
         if isinstance(given, FurtherTest):
             term = next(tests)
             structure = term.matrices.structure(x, term.test)
-            again = replace(given, measurement=_again(term.test, structure, problem.n_variables, rng))
+            drawn, delays = _again(term.test, structure, problem.n_variables, rng), next(modal).delays
+            again = replace(given, measurement=drawn if delays is None else without_delays(drawn, -delays.values))
         else:
             _, value, std = given.column("Prior")
             at = value + std * next(priors).numbers(x)

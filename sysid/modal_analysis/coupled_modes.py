@@ -80,7 +80,7 @@ def with_couplings(
     model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True)
     beyond, equations = max(fit.reduced, 1.0), model.normal_equations(p, fit.levels)
     promised, count = score_of_couplings(model, equations)
-    above = np.arange(model.size) >= model.n_fit + model.n * model.d
+    above = (np.arange(model.size) >= model.n_fit + model.n * model.d) & (np.arange(model.size) < model.delays)
     # What modes above the lines leave would pass for couplings of those that stand for them.
     if promised < max(beyond * beyond_chance(count), score(equations, above)[0]):
         return fit

@@ -32,6 +32,7 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
 
 _PERIODS = 15  # of the last line, either way, that a delay is looked for in
+_FAR = 5.0  # times errors that channels have of their own, of what the noise of the base makes in all of them
 _LEAST_TURN = 1e-4  # rad at the last line: what a smaller delay does shows in no result
 
 
@@ -60,8 +61,15 @@ class Delays:
     def __bool__(self) -> bool:
         return bool(np.any(self.values))
 
+    @property
+    def beyond_chance(self) -> NDArray[np.bool_]:
+        """Channels whose delay chance does not explain, (k,)."""
+        return np.abs(self.values) > most_deviations(1 if self.of_base else self.values.size) * self.std
+
     def at(self, told: NDArray[np.intp], count: int) -> Delays:
-        """These as those of some of so many channels, where the others tell none."""
+        """These as those of some of so many channels, where the others tell none but that of the base."""
+        if self.of_base:
+            return Delays(np.full(count, self.values[0]), np.full(count, self.std[0]), True)
         values, std = np.zeros((2, count))
         values[told], std[told] = self.values, self.std
         return Delays(values, std, self.of_base)
@@ -94,7 +102,8 @@ class Clock:
     """A test on the clock of its base: without its delays, and what its poles leave, where these show."""
 
     test: Measurement
-    delays: Delays
+    delays: Delays | None
+    """None where they are not asked for."""
     beside: BesidePoles | None
 
     @classmethod
@@ -125,20 +134,25 @@ def delays_beyond_chance(values: Array, covariance: Array, least: float) -> Dela
         return None
     ones = inverse.sum(axis=0)
     mean, error = float(ones @ values / ones.sum()), float(1 / np.sqrt(ones.sum()))
-    left = values - mean
-    if count > 1 and left @ inverse @ left < beyond_chance(count - 1):
+    apart = values - mean
+    if count > 1 and apart @ inverse @ apart < beyond_chance(count - 1):
         of_base = Delays(np.full(count, mean), np.full(count, error), True)
         return of_base if abs(mean) > max(least, most_deviations() * error) else None
     late = np.zeros(count, bool)
-    for channel in np.argsort(-np.abs(values) / np.sqrt(np.diag(covariance))):
-        late[channel] = True
-        rest = np.linalg.pinv(covariance[np.ix_(~late, ~late)], hermitian=True)
-        if values[~late] @ rest @ values[~late] < beyond_chance(count - int(np.count_nonzero(late))):
+    rest, left = inverse, np.inf
+    while left >= beyond_chance(count - int(np.count_nonzero(late))):
+        trials = [late | (np.arange(count) == channel) for channel in np.flatnonzero(~late)]
+        inverses = [np.linalg.pinv(covariance[np.ix_(~one, ~one)], hermitian=True) for one in trials]
+        squares = [values[~one] @ inner @ values[~one] for one, inner in zip(trials, inverses, strict=True)]
+        best = int(np.argmin(squares))
+        late, rest, left = trials[best], inverses[best], float(squares[best])
+        if late.all():
             break
     carried = covariance[np.ix_(late, ~late)] @ rest
     found, std = np.zeros(count), np.zeros(count)
     found[late] = values[late] - carried @ values[~late]
-    std[late] = np.sqrt(np.diag(covariance[np.ix_(late, late)] - carried @ covariance[np.ix_(~late, late)]))
+    own = np.diag(covariance[np.ix_(late, late)] - carried @ covariance[np.ix_(~late, late)])
+    std[late] = np.sqrt(np.maximum(own, 0.0))
     found[np.abs(found) < np.maximum(least, most_deviations(count) * std)] = 0.0
     std[found == 0] = 0.0
     return Delays(found, std) if np.any(found) else None
@@ -347,10 +361,13 @@ def _settled(best: _Late, steps: int = 15, near: float = 0.05, *, held: bool = F
 
 
 def _found(end: _Late, test: Measurement) -> Delays | None:
-    """Delays beyond chance at the end of a fit, of the channels that tell them and that it explains."""
+    """Delays beyond chance at the end of a fit, of the channels that tell them and that it explains.
+
+    Of whole records, whose base has noise that all channels share, those far beyond it.
+    """
     shown = np.diag(end.equations[0])[end.poles.size :] > 0
     told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
-    covariance = end.step()[2][np.ix_(told, told)]
+    covariance = end.step()[2][np.ix_(told, told)] * (_FAR**2 if test.is_whole else 1.0)
     found = delays_beyond_chance(end.delays[told], covariance, least_delay(test))
     return found and found.at(told, end.delays.size)
 

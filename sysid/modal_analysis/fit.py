@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -51,8 +52,8 @@ from sysid.structure.structure import Array, ComplexArray
 def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMonitor | None = None) -> RecordFit:
     """Modes, transients and noise of whole records, its levels smooth over the lines where they are no constants.
 
-    Delays that were found already, s, are taken off sensors and force, and what the fit finds left of them. Where the
-    monitor stops it, the best fit until then, with `stopped` set.
+    Delays that were found already, s, are taken off sensors and force, and what the fit finds left of them; None where
+    they are not asked for. Where the monitor stops it, the best fit until then, with `stopped` set.
 
     Raises
     ------
@@ -61,12 +62,12 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
     Stop, KeyboardInterrupt
         Where the monitor stops it before there was a fit.
     """
-    delays = np.zeros(test.n_sensors + (test.force is not None)) if delays is None else delays
+    fit = _whole_fit if delays is None else functools.partial(_on_one_clock, delays=delays)
     if monitor is None:
-        return _on_one_clock(test, delays, FitMonitor())
+        return fit(test, monitor=FitMonitor())
     try:
         with monitor.at_work():
-            return _on_one_clock(test, delays, monitor)
+            return fit(test, monitor=monitor)
     except (Stop, KeyboardInterrupt):
         best = monitor.best
         if not isinstance(best, RecordFit):
@@ -85,23 +86,32 @@ def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
         raise InputError(sentence)
 
 
-def _on_one_clock(test: Measurement, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
-    """The fit without the delays that it finds itself; modes are looked for anew where these are of other channels."""
+def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
+    """The fit without the delays that it finds itself, as long as these make it likelier.
+
+    Modes are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
+    """
     fit = _whole_fit(without_delays(test, delays), monitor)
-    for _ in range(rounds):
-        left = delays_left(fit)
-        if left is None:
-            break
-        monitor.doing, total = "delays", delays + left
-        turned = without_delays(test, total)
-        if np.any((total != 0) & (delays == 0)):
-            trial = _whole_fit(turned, monitor)
-        else:
-            trial = on_turned(fit, turned, monitor=monitor)
-        price = np.count_nonzero(total) - np.count_nonzero(delays)
-        if trial.schwarz - fit.schwarz < price * np.log(fit.model.numbers) / 2:
-            break
-        fit, delays = trial, total
+    try:
+        for _ in range(rounds):
+            left = delays_left(fit)
+            if left is None:
+                break
+            monitor.doing, total = "delays", delays + left
+            turned = without_delays(test, total)
+            if np.any((total != 0) & (delays == 0)):
+                trial = _whole_fit(turned, monitor)
+            else:
+                trial = on_turned(fit, turned, monitor=monitor)
+            price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
+            if trial.schwarz - fit.schwarz < price * np.log(fit.model.numbers) / 2:
+                break
+            fit, delays = trial, total
+        certain = delays_of(fit).beyond_chance
+        if not np.array_equal(certain, delays != 0):
+            fit = on_turned(fit, without_delays(test, np.where(certain, delays, 0.0)), monitor=monitor)
+    except (Stop, KeyboardInterrupt):
+        return replace(fit, stopped=True)
     return fit
 
 
@@ -235,7 +245,7 @@ def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMo
     ----------
     test : Measurement
     delays : Delays, optional
-        Of its sensors and force, which are taken off: see `find_delays`.
+        Of its sensors and force, which are taken off: see `find_delays`. None where they are not asked for.
     monitor : FitMonitor, optional
 
     Raises
@@ -243,14 +253,15 @@ def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMo
     InputError, Stop, KeyboardInterrupt
         As `whole_fit` does.
     """
-    delays = delays or Delays.none(test)
+    values = None if delays is None else delays.values
     if test.whole is None:
-        return replace(ModalEstimate.of_lines(without_delays(test, delays.values)), delays=delays)
+        turned = test if values is None else without_delays(test, values)
+        return replace(ModalEstimate.of_lines(turned), delays=delays)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        return estimate(whole_fit(test, delays.values, monitor=monitor))
+        return estimate(whole_fit(test, values, monitor=monitor))
 
 
-def fit_tests(tests: Iterable[tuple[Measurement, Delays]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
+def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
     """The modes of each test without its delays; they share the time of the monitor.
 
     Raises

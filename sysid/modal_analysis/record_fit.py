@@ -23,6 +23,7 @@ from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.noise_levels import floors, likeliest_levels
 from sysid.modal_analysis.record_model import (
+    TRACES,
     HeldShapes,
     NormalEquations,
     Parameters,
@@ -255,8 +256,9 @@ def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None =
     """The fit of the same records with other delays taken off."""
     assert test.whole is not None
     test = replace(test, whole=replace(test.whole, varying=fit.model.whole.varying))
-    p, more = fit.parameters, trace_count(test) - fit.parameters.traces.shape[2]
-    traces = np.pad(p.traces, ((0, 0), (0, 0), (0, max(more, 0))))[:, :, : trace_count(test)]
+    p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
+    traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
+    traces[..., :TRACES] = p.traces[..., :TRACES]
     return refitted(replace(fit, test=test), replace(p, traces=traces), monitor=monitor)
 
 

@@ -32,7 +32,7 @@ from sysid.modal_analysis.response import real_times
 from sysid.modal_analysis.varying_levels import segments
 from sysid.structure.structure import Array, ComplexArray
 
-_TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
+TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
 
 
 class RecordModel(SpectralModel):
@@ -79,7 +79,7 @@ class RecordModel(SpectralModel):
         if self.pulses.size:  # a run that begins and ends at rest has none
             of_channels = np.append(reached, np.repeat(reached[self.n :], self.d - 1, axis=0), axis=0)
             own = of_channels & np.isin(np.arange(test.n_runs), self.whole.moving)[:, None, None]
-            traces = np.concatenate([np.ones((*own.shape[:2], _TRACES), bool), own], axis=2)
+            traces = np.concatenate([np.ones((*own.shape[:2], TRACES), bool), own], axis=2)
             self.held[self.kept + self.n_ends : self.coupling.start] = ~traces.ravel()
 
     def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
@@ -451,7 +451,7 @@ class CoupledChunk(Chunk):
 def trace_count(test: Measurement) -> int:
     """Real numbers of each channel and run beside the response and its transients."""
     assert test.whole is not None
-    return _TRACES + test.whole.pulses(test.freq[-1])[0].size
+    return TRACES + test.whole.pulses(test.freq[-1])[0].size
 
 
 def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:

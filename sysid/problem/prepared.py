@@ -43,7 +43,7 @@ LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 def clocks_of(stated: StatedProblem) -> list[Clock]:
     """Each test without its delays; the problem's own as it is where a misfit stands in its place."""
     first, *further = stated.tests
-    own = Clock.of(first) if stated.misfit is None else Clock(first, Delays.none(first), None)
+    own = Clock.of(first) if stated.misfit is None else Clock(first, None, None)
     return [own, *map(Clock.of, further)]
 
 
@@ -145,7 +145,7 @@ class Prepared(SearchSpace):
 
     def __init__(
         self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False,
-        delays: Sequence[Delays] = (), fits: Sequence[RecordFit | None] = (),
+        delays: Sequence[Delays | None] = (), fits: Sequence[RecordFit | None] = (),
     ) -> None:  # fmt: skip
         self.stated, self.in_squares = stated, in_squares or stated.loss == "squares"
         self._fits = tuple(fits) or (None,) * len(stated.tests)
@@ -187,9 +187,14 @@ class Prepared(SearchSpace):
         return cls(stated, delays=delays, fits=read)
 
     @cached_property
-    def delays(self) -> tuple[Delays, ...]:
+    def delays(self) -> tuple[Delays | None, ...]:
         """Delays of each test's sensors and force, as they are found before its modes."""
         return tuple(clock.delays for clock in clocks_of(self.stated))
+
+    @cached_property
+    def validation(self) -> tuple[Measurement, ...]:
+        """Tests that are predicted and never fitted, without delays of their own."""
+        return tuple(Clock.of(test).test for test in self.stated.validation)
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:

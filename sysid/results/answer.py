@@ -23,6 +23,7 @@ from sysid.finding import (
 )
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.delays import Clock
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -250,8 +251,9 @@ class Answer:
 
     @cached_property
     def validation(self) -> tuple[Measurement, ...]:
-        """The problem's validation tests; of whole records without the transients that this structure makes of them."""
-        return tuple(without_transients_of(test, self.structure) for test in self.records.validation)
+        """The problem's validation tests without their delays; of whole records without this structure's transients."""
+        clocks = map(Clock.of, self.records.validation)
+        return tuple(without_transients_of(clock.test, self.structure) for clock in clocks)
 
     @property
     def _in_modes(self) -> bool:

@@ -73,7 +73,7 @@ def _unfitted(context: Context) -> Iterator[tuple[int, Measurement]]:
     The modes of an answer in the band are said to hold at its lines alone.
     """
     first, last = context.problem.stated.measurement.freq[[0, -1]]
-    for i, test in enumerate(context.problem.stated.validation, start=1):
+    for i, test in enumerate(context.problem.validation, start=1):
         inside = (test.freq >= first) & (test.freq <= last) | (not context.problem.answers_in_band)
         if np.any(test.base[..., inside]) and np.any(test.response[..., inside]):
             yield i, without_transients_of(test.at(inside), context.end.structure)
@@ -232,11 +232,9 @@ def changes(problem: Prepared) -> list[Change]:
     """Modes whose frequencies change between stretches of all records, by more than noise makes of them."""
     if not problem.formulation.fits_records:
         return []
-    given = problem.stated.measurement
+    given = problem.modal[0].given
     scaled = levels_are_known(given)
-    unfitted = [
-        (i, test) for i, test in enumerate(problem.stated.validation, start=1) if scaled and levels_are_known(test)
-    ]
+    unfitted = [(i, test) for i, test in enumerate(problem.validation, start=1) if scaled and levels_are_known(test)]
     tests = [(0, given), *unfitted]
     every = _modes(problem.screened.modal[0])
     if every is None:
