@@ -69,9 +69,9 @@ def fitted_once():
     """Fit whole records that several tests of a module identify once: gives the function that does, `whole_fit`."""
     fits, of = {}, fit.whole_fit
 
-    def once(test, *, monitor=None):
+    def once(test, delays=None, *, monitor=None):
         if id(test) not in fits:
-            fits[id(test)] = test, of(test)  # the test too, so that no other one gets its place in memory
+            fits[id(test)] = test, of(test, delays)  # the test too, so that no other one gets its place in memory
         return fits[id(test)][1]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -213,6 +213,8 @@ def _joined(test: Measurement) -> Measurement:
 class _Late:
     """Channels without their delays, fitted on poles, residues and terms 1 and w²; what is left tells of the delays.
 
+    With `rising` a term ``i w`` too, which no structure has.
+
     Parameters
     ----------
     still : Measurement
@@ -225,15 +227,16 @@ class _Late:
     """
 
     def __init__(
-        self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, *, complex_residues: bool
-    ) -> None:
+        self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, *, complex_residues: bool,
+        rising: bool = False,
+    ) -> None:  # fmt: skip
         self.still, self.clocks, self.delays, self.poles = still, clocks, delays, poles
         self.complex_residues = complex_residues
         self.omega, self.ratios = np.exp(poles.reshape(2, -1))
         test = without_delays(still, delays[clocks])
         self.records = records = Records(test)
-        square = (test.freq / test.freq[-1]) ** 2
-        direct = records.basis(np.stack([np.ones_like(square), square]) + 0j, records.driven)
+        x = 1j * test.freq / test.freq[-1]
+        direct = records.basis(np.stack([x**0, x**2, x])[: 2 + rising], records.driven)
         functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
         direct = np.hstack([direct, _of_runs(test, records)])
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
@@ -369,7 +372,26 @@ def _found(end: _Late, test: Measurement) -> Delays | None:
     told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
     covariance = end.step()[2][np.ix_(told, told)] * (_FAR**2 if test.is_whole else 1.0)
     found = delays_beyond_chance(end.delays[told], covariance, least_delay(test))
-    return found and found.at(told, end.delays.size)
+    every = found and found.at(told, end.delays.size)
+    return every if every is not None and _agrees(end, every) else None
+
+
+def _agrees(end: _Late, found: Delays, share: float = 0.2) -> bool:
+    """True where delays are the same beside a term that grows as i w: what a model misses of another kind is none.
+
+    Up to this share, or what noise leaves open beside that term, which must not hide them.
+    """
+    beside = _Late(
+        end.still, end.clocks, end.delays, end.poles, complex_residues=end.complex_residues, rising=True
+    )  # fmt: skip
+    _, step, covariance = beside.step()
+    late, std = found.values != 0, np.sqrt(np.diag(covariance))
+    off = np.abs(end.delays + step - found.values)[late]
+    open_ = most_deviations(late.sum()) * std[late]
+    return bool(
+        np.all(off < np.maximum(share * np.abs(found.values[late]), open_))
+        and np.all(open_ < np.abs(found.values[late]))
+    )
 
 
 def least_delay(test: Measurement) -> float:

@@ -12,6 +12,7 @@ from sysid import FullMass, InputError, LumpedMass, Problem, SpectralStiffness, 
 from sysid.assessment.checks import stated
 from sysid.assessment.checks.mistakes import check_records, mistakes_of
 from sysid.modal_analysis.direct_terms import direct_terms
+from sysid.problem.prepared import clocks_of
 
 BY_RECORDS = [name for name, cause in CAUSES.items() if SPECTRA in cause.kinds and not cause.untold]
 
@@ -140,7 +141,8 @@ def test_stated_frequencies_and_lines_in_rad_per_s(factor, words):
 def test_right_units_show_in_the_first_structures_that_a_model_allows(monkeypatch, form, force):
     seen, structures = [], stated._structures
     monkeypatch.setattr(stated, "_structures", lambda of: (seen.append(one) or one for one in structures(of)))
-    assert check_records(problem(form, right(SPECTRA, force=force).test).prepared) == ()
+    stated_problem = problem(form, right(SPECTRA, force=force).test)
+    assert check_records(stated_problem.prepared, clocks_of(stated_problem)) == ()
     assert 1 <= len(seen) <= 6
 
 

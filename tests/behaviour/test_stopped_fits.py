@@ -163,7 +163,7 @@ def test_a_test_without_modes_beside_others_that_have_them_is_named(storeys):
 
     monitor = Second(check=lambda kept: Stopped(-1).stop(True) if monitor.ends else None)
     with pytest.raises(Stop, match="2 of 2"):
-        fit_tests(tests, monitor)
+        fit_tests([(test, None) for test in tests], monitor)
 
 
 @posix
