@@ -96,7 +96,8 @@ def with_couplings(
         more = fewer
     gained = 2 * (more.likelihood - fit.likelihood)
     least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
-    if not (more.settled and passive(more.parameters) and gained > beyond * least):
+    alone = more.parameters.coupling is None  # where one mode is left
+    if alone or not (more.settled and passive(more.parameters) and gained > beyond * least):
         return fit
     own = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     return fit if own is None else replace(more, parameters=own)

@@ -211,9 +211,9 @@ def _joined(test: Measurement) -> Measurement:
 
 
 class _Late:
-    """Channels without their delays, fitted on poles, residues and terms 1 and w²; what is left tells of the delays.
+    """Channels without their delays, fitted on poles, residues and terms without; what is left tells of the delays.
 
-    With `rising` a term ``i w`` too, which no structure has.
+    The terms are 1, and w² and i w³ of modes above the lines and of their damping. With `rising` a term ``i w`` too, which no structure has.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ class _Late:
         test = without_delays(still, delays[clocks])
         self.records = records = Records(test)
         x = 1j * test.freq / test.freq[-1]
-        direct = records.basis(np.stack([x**0, x**2, x])[: 2 + rising], records.driven)
+        direct = records.basis(np.stack([x**0, x**2, x**3, x])[: 3 + rising], records.driven)
         functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
         direct = np.hstack([direct, _of_runs(test, records)])
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))

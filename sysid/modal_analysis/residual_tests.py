@@ -33,6 +33,7 @@ from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
 
 _FEWEST = 8  # lines of a band
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
+_MISSED = 5.0  # times the noise, that what a model misses may be for a delay
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
@@ -367,11 +368,15 @@ def _taken(fit: RecordFit) -> tuple[Array, bool]:
 
 
 def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
-    """Step of delays along columns (k, q) of all of them, s, and its covariance; zero where nothing tells them."""
+    """Step of delays along columns (k, q) of all of them, s, and its covariance; zero where nothing tells them.
+
+    Where what is left is no white noise the model misses something, which delays make up for as far as they can.
+    """
     at, first = fit.model.size, fit.asked.delays
     turn = np.zeros((fit.asked.size, at + along.shape[1]))
     turn[:at, :at], turn[first:, at:] = np.eye(at), along
     normal, size = unit_diagonal(turn.T @ fit.equations.normal @ turn)
     half = half_inverse(normal, ROUND_OFF)
     step, rows = half @ (half.T @ (turn.T @ fit.equations.gradient / size)), half[at:] / size[at:, None]
-    return step[at:] / size[at:], max(fit.reduced, 1.0) / 2 * rows @ rows.T
+    missed = _MISSED**2 if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else 1.0
+    return step[at:] / size[at:], missed * max(fit.reduced, 1.0) / 2 * rows @ rows.T
