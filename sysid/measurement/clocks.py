@@ -16,8 +16,6 @@ def without_delays(test: Measurement, delays: Array) -> Measurement:
     Spectra of whole records are turned about: a record that begins earlier holds its beginning at its end. `taken` of
     its `WholeRecords` says so, and their model has the samples there for unknowns.
     """
-    if not np.any(delays):
-        return test
     turn = np.exp(2j * np.pi * delays[:, None] * test.freq)
     force, whole = (None if test.force is None else test.force * turn[-1]), test.whole
     if whole is not None:

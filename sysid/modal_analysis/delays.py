@@ -90,11 +90,9 @@ class Delays:
 
 def stored_delays(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Delays]:
     """Delays of the tests of a stored problem; results of before hold none."""
-    found = tree.get("delays") or [None] * len(tests)
-    return [
-        Delays.none(test) if one is None else Delays.from_tree(one, test)
-        for one, test in zip(found, tests, strict=False)
-    ]
+    none = [Delays.none(test).to_tree() for test in tests]
+    found = zip(tree.get("delays") or none, none, tests, strict=False)
+    return [Delays.from_tree(one or other, test) for one, other, test in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +138,12 @@ def delays_beyond_chance(values: Array, covariance: Array, least: float) -> Dela
         return of_base if abs(mean) > max(least, most_deviations() * error) else None
     late = np.zeros(count, bool)
     rest, left = inverse, np.inf
-    while left >= beyond_chance(count - int(np.count_nonzero(late))):
+    while left > beyond_chance(count - int(np.count_nonzero(late))):  # nothing is left where all are late
         trials = [late | (np.arange(count) == channel) for channel in np.flatnonzero(~late)]
         inverses = [np.linalg.pinv(covariance[np.ix_(~one, ~one)], hermitian=True) for one in trials]
         squares = [values[~one] @ inner @ values[~one] for one, inner in zip(trials, inverses, strict=True)]
         best = int(np.argmin(squares))
         late, rest, left = trials[best], inverses[best], float(squares[best])
-        if late.all():
-            break
     carried = covariance[np.ix_(late, ~late)] @ rest
     found, std = np.zeros(count), np.zeros(count)
     found[late] = values[late] - carried @ values[~late]
@@ -180,8 +176,8 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
         if at is not None and np.any(far):
             other = _settled(_Late.on(still, clocks, far, at.at.poles))
             end = other if other.explains_more_than(end) else end
-    if complex_.explains_more_than(end):
-        complex_ = _settled(complex_, held=True)
+    complex_ = _settled(complex_, held=True)
+    if not end.explains_more_than(complex_):
         end = _settled(complex_)
         if not end.explains_more_than(complex_):
             return none
@@ -190,8 +186,8 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
 
 def _clocks(test: Measurement) -> NDArray[np.intp]:
     """Which delay each channel has, (n_sensors + d,): that of the force is one in all directions."""
-    force = 0 if test.force is None else test.n_base
-    return np.concatenate([np.arange(test.n_sensors), np.full(force, test.n_sensors)])
+    force = np.full((test.force is not None) * test.n_base, test.n_sensors)
+    return np.concatenate([np.arange(test.n_sensors), force])
 
 
 def _joined(test: Measurement) -> Measurement:
@@ -213,7 +209,8 @@ def _joined(test: Measurement) -> Measurement:
 class _Late:
     """Channels without their delays, fitted on poles, residues and terms without; what is left tells of the delays.
 
-    The terms are 1, and w² and i w³ of modes above the lines and of their damping. With `rising` a term ``i w`` too, which no structure has.
+    The terms are 1, and w² and i w³ of modes above the lines and of their damping. With `rising` a term ``i w`` too,
+    which no structure has.
 
     Parameters
     ----------
@@ -372,8 +369,10 @@ def _found(end: _Late, test: Measurement) -> Delays | None:
     told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
     covariance = end.step()[2][np.ix_(told, told)] * (_FAR**2 if test.is_whole else 1.0)
     found = delays_beyond_chance(end.delays[told], covariance, least_delay(test))
-    every = found and found.at(told, end.delays.size)
-    return every if every is not None and _agrees(end, every) else None
+    if found is None:
+        return None
+    every = found.at(told, end.delays.size)
+    return every if _agrees(end, every) else None
 
 
 def _agrees(end: _Late, found: Delays, share: float = 0.2) -> bool:

@@ -14,7 +14,10 @@ from sysid.assessment.checks.mistakes import check_records, mistakes_of
 from sysid.modal_analysis.direct_terms import direct_terms
 from sysid.problem.prepared import clocks_of
 
-BY_RECORDS = [name for name, cause in CAUSES.items() if SPECTRA in cause.kinds and not cause.untold]
+BY_RECORDS = [
+    name for name, cause in CAUSES.items()
+    if SPECTRA in cause.kinds and not cause.untold and cause.finding != "late sensor"  # which is taken off before
+]  # fmt: skip
 
 
 def told(test):
@@ -47,10 +50,6 @@ def test_each_cause_is_named_and_nothing_else(name):
         (lambda t: with_sensor(t, -1.0), "sign", "contradicts", "sensor 3", {"factor": -1.0}),
         (lambda t: with_sensor(t, 1000.0), "unit", "contradicts", "sensor 3", {"factor": 1000.0}),
         (lambda t: with_sensor(t, 0.7), "gain", "contradicts", "sensor 3", {"factor": 0.7}),
-        (
-            lambda t: with_sensor(t, np.exp(-2j * np.pi * 1e-3 * t.freq)), "late sensor", "contradicts", "sensor 3",
-            {"delay": 1e-3},
-        ),
         (lambda t: replace(t, response=1000 * t.response), "unit", "blocking", None, {"factor": 1000.0}),
         (lambda t: replace(t, response=-t.response), "sign", "blocking", None, {"factor": -1.0}),
         (lambda t: replace(t, rigid_body=t.rigid_body * [1.0, -1.0]), "sign", "blocking", "base y", {}),
@@ -60,8 +59,8 @@ def test_each_cause_is_named_and_nothing_else(name):
 def test_mistakes_of_two_directions(change, kind, severity, channel, numbers):
     first = told(change(replace(random_test(noise=0.002), base_axes=("x", "y"))))[0]
     assert (first.kind, first.severity, first.channel) == (kind, severity, channel)
-    for name, value in numbers.items():  # a delay is known by the first terms of a series
-        assert first.numbers[name] == pytest.approx(value, rel=0.1 if name == "delay" else 0.03)
+    for name, value in numbers.items():
+        assert first.numbers[name] == pytest.approx(value, rel=0.03)
 
 
 def test_swapped_sensors_of_two_directions_are_told_without_any_model():

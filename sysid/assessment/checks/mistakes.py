@@ -308,7 +308,7 @@ def wrong_records(context: Context) -> Iterator[Finding]:
 def late_channels(context: Context) -> Iterator[Finding]:
     """Sensors or the force were recorded late against the base: their delays are found, and taken off."""
     problem = context.problem
-    tests = problem.modal if problem.formulation.fits_records else problem.modal[1:]
+    tests = problem.modal[not problem.formulation.fits_records :]
     yield from of_tests([list(_late(one.given, one.delays or Delays.none(one.given))) for one in tests])
 
 
