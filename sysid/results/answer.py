@@ -168,10 +168,12 @@ class Answer:
     def confidence(self) -> tuple[str, ...]:
         """Sentences on how far the answer can be trusted, the weightiest first.
 
-        Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
-        what else is to be known of records, bounds and sensors.
+        Delays that were taken off before all else; why there is no fit; what speaks against it, and what is open; what
+        fixes the matrices where nothing is; and what else is to be known of records, bounds and sensors.
         """
-        return (*self.undetermined, *self.closed_by, *map(str, self.notes))
+        late = tuple(map(str, self.of_kind("late sensor")))
+        every = (*late, *self.undetermined, *self.closed_by, *map(str, self.notes))
+        return tuple(dict.fromkeys(every))
 
     @property
     def message(self) -> str:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -278,15 +277,22 @@ def _named(lock: Path) -> Path:
         aside.unlink(missing_ok=True)
 
 
+def _host() -> str:
+    """Name of this machine."""
+    import socket  # which takes some milliseconds, and is needed where something is written
+
+    return socket.gethostname()
+
+
 def _process_record() -> str:
     """Host, process and when it began, as one line."""
-    return f"{socket.gethostname()} {os.getpid()} {_start_of_process(os.getpid())}"
+    return f"{_host()} {os.getpid()} {_start_of_process(os.getpid())}"
 
 
 def _is_alive(record: str) -> bool:
     """True where the process of a record is there; one on another host is taken to be."""
     host, pid, started = record.split(" ")
-    if host != socket.gethostname():
+    if host != _host():
         return True
     try:
         os.kill(int(pid), 0)
