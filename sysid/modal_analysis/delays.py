@@ -29,7 +29,7 @@ from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import stacked
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
+from sysid.structure.thresholds import EXACT, ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
 
 _PERIODS = 15  # of the last line, either way, that a delay is looked for in
 _FAR = 5.0  # times errors that channels have of their own, of what the noise of the base makes in all of them
@@ -162,7 +162,7 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     matter to a fit, which finds what is left: see `sysid.modal_analysis.fit`.
     """
     none = Delays.none(test)
-    if beside is None:
+    if beside is None or beside.at.misfit < EXACT:  # as no late channel is
         return none
     still, clocks = _joined(beside.test), _clocks(test)
     first = _Late.on(still, clocks, np.zeros(none.values.size), beside.at.poles)
