@@ -283,11 +283,7 @@ class _Late:
     @cached_property
     def equations(self) -> tuple[Array, Array]:
         """Normal matrix of poles and delays, each channel in units of its level, and descent."""
-        records, level = self.records, self.level
-        turned = replace(self.records_test, response=2j * np.pi * self.still.freq * self.records_test.response)
-        late = Records(turned).data
-        for _ in range(2):  # once leaves round-off of what is nearly along the basis
-            late = late - self.basis.times(self.basis.answers(late))
+        records, level, late = self.records, self.level, self.late
         slopes = records.pole_slopes(self.omega, self.ratios, velocity=self.complex_residues)
         beside = self.basis.beside(slopes)
         of_left, of_late = (beside.products(beside.shared.T @ rows, rows) for rows in (self.left, late))
@@ -298,6 +294,24 @@ class _Late:
         across, size = -across @ of_clock, np.sum((late / level) ** 2, axis=0) @ of_clock
         both = np.block([[normal, across], [across.T, np.diag(size)]])
         return both, np.concatenate([descent, -np.sum(late / level * (self.left / level), axis=0) @ of_clock])
+
+    @cached_property
+    def late(self) -> Array:
+        """What a second of delay makes of each channel beside the basis, (rows, channels)."""
+        turned = replace(self.records_test, response=2j * np.pi * self.still.freq * self.records_test.response)
+        late = Records(turned).data
+        for _ in range(2):  # once leaves round-off of what is nearly along the basis
+            late = late - self.basis.times(self.basis.answers(late))
+        return late
+
+    @property
+    def uneven(self) -> Array:
+        """Times the mean that what is left is where a delay shows, one at least, (k,), as of noise stated wrongly."""
+        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, self.level.size // self.clocks.size)]
+        share = (self.late / self.level) ** 2
+        seen = np.sum(share * (self.left / self.level) ** 2, axis=0) @ of_clock * len(self.left)
+        every = np.sum(share, axis=0) @ of_clock
+        return np.sqrt(np.maximum(seen / np.maximum(every, np.finfo(float).tiny), 1.0))
 
     @property
     def records_test(self) -> Measurement:
@@ -318,7 +332,8 @@ class _Late:
         root = unit[:, None] * vectors / np.sqrt(np.maximum(values, ROUND_OFF * values[-1]))
         step, m = root @ (descent @ root), self.poles.size
         freedom = max(len(self.left) - self.unknowns // self.left.shape[1], 1)
-        return step[:m], step[m:], self.shared_errors / freedom * root[m:] @ root[m:].T
+        errors = self.uneven[:, None] * root[m:]
+        return step[:m], step[m:], self.shared_errors / freedom * errors @ errors.T
 
     def promise(self) -> float:
         """Sum of squares of the delays that one step finds, in units of their errors."""
