@@ -165,8 +165,8 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     if beside is None or beside.at.misfit < EXACT:  # as no late channel is
         return none
     still, clocks = _joined(beside.test), _clocks(test)
-    first = _Late.on(still, clocks, np.zeros(none.values.size), beside.at.poles)
-    complex_ = _Late.on(still, clocks, first.delays, beside.at.poles, complex_residues=True)
+    first = _Late(still, clocks, np.zeros(none.values.size), beside.at.poles)
+    complex_ = _Late(still, clocks, first.delays, beside.at.poles, complex_residues=True)
     if first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
     end = _settled(first)
@@ -174,7 +174,7 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     if turn > 1 or complex_.explains_more_than(end):  # perhaps many periods late, of which steps find one alone
         far, at = _on_grid(beside.test, still, clocks)
         if at is not None and np.any(far):
-            other = _settled(_Late.on(still, clocks, far, at.at.poles))
+            other = _settled(_Late(still, clocks, far, at.at.poles))
             end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
     if not end.explains_more_than(complex_):
@@ -224,13 +224,13 @@ class _Late:
     """
 
     def __init__(
-        self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, *, complex_residues: bool,
-        rising: bool = False,
+        self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array,
+        complex_residues: bool = False, *, rising: bool = False,
     ) -> None:  # fmt: skip
         self.still, self.clocks, self.delays, self.poles = still, clocks, delays, poles
         self.complex_residues = complex_residues
         self.omega, self.ratios = np.exp(poles.reshape(2, -1))
-        test = without_delays(still, delays[clocks])
+        self.test = test = without_delays(still, delays[clocks])
         self.records = records = Records(test)
         x = 1j * test.freq / test.freq[-1]
         direct = records.basis(np.stack([x**0, x**2, x**3, x])[: 3 + rising], records.driven)
@@ -247,26 +247,23 @@ class _Late:
         least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
         self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
 
-    @classmethod
-    def on(
-        cls, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array, complex_residues: bool = False
-    ) -> _Late:
-        """The same, with real residues where no others are asked for."""
-        return cls(still, clocks, delays, poles, complex_residues=complex_residues)
-
     def moved(self, poles: Array, delays: Array) -> _Late:
         """The fit after a step, in which no pole becomes one that answers like a term without poles."""
         m = self.omega.size
         poles = self.poles + np.clip(poles, -0.3, 0.3)
         poles[m:] = np.minimum(poles[m:], np.log(MOST_DAMPED))
-        return _Late.on(self.still, self.clocks, self.delays + delays, poles, self.complex_residues)
+        return _Late(self.still, self.clocks, self.delays + delays, poles, self.complex_residues)
+
+    @cached_property
+    def of_clock(self) -> Array:
+        """One where a channel of the records has a delay, (channels, k)."""
+        return np.eye(self.delays.size)[np.tile(self.clocks, self.level.size // self.clocks.size)]
 
     @property
     def misfits(self) -> Array:
         """Relative residual of the channels of each clock, (k,)."""
-        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, self.level.size // self.clocks.size)]
-        size = np.sum(self.records.data**2, axis=0) @ of_clock
-        return np.sqrt(self.level**2 @ of_clock / np.maximum(size, np.finfo(float).tiny))
+        size = np.sum(self.records.data**2, axis=0) @ self.of_clock
+        return np.sqrt(self.level**2 @ self.of_clock / np.maximum(size, np.finfo(float).tiny))
 
     @cached_property
     def shared_errors(self) -> float:
@@ -290,15 +287,14 @@ class _Late:
         normal, descent = beside.pole_equations(of_left / level, self.residues / level)
         each = np.concatenate([self.residues, self.residues]).reshape(of_late.shape)
         across = (of_late / level * (each / level)).reshape(self.poles.size, -1, level.size).sum(axis=1)
-        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, level.size // self.clocks.size)]
-        across, size = -across @ of_clock, np.sum((late / level) ** 2, axis=0) @ of_clock
+        across, size = -across @ self.of_clock, np.sum((late / level) ** 2, axis=0) @ self.of_clock
         both = np.block([[normal, across], [across.T, np.diag(size)]])
-        return both, np.concatenate([descent, -np.sum(late / level * (self.left / level), axis=0) @ of_clock])
+        return both, np.concatenate([descent, -np.sum(late / level * (self.left / level), axis=0) @ self.of_clock])
 
     @cached_property
     def late(self) -> Array:
         """What a second of delay makes of each channel beside the basis, (rows, channels)."""
-        turned = replace(self.records_test, response=2j * np.pi * self.still.freq * self.records_test.response)
+        turned = replace(self.test, response=2j * np.pi * self.test.freq * self.test.response)
         late = Records(turned).data
         for _ in range(2):  # once leaves round-off of what is nearly along the basis
             late = late - self.basis.times(self.basis.answers(late))
@@ -307,16 +303,10 @@ class _Late:
     @property
     def uneven(self) -> Array:
         """Times the mean that what is left is where a delay shows, one at least, (k,), as of noise stated wrongly."""
-        of_clock = np.eye(self.delays.size)[np.tile(self.clocks, self.level.size // self.clocks.size)]
         share = (self.late / self.level) ** 2
-        seen = np.sum(share * (self.left / self.level) ** 2, axis=0) @ of_clock * len(self.left)
-        every = np.sum(share, axis=0) @ of_clock
+        seen = np.sum(share * (self.left / self.level) ** 2, axis=0) @ self.of_clock * len(self.left)
+        every = np.sum(share, axis=0) @ self.of_clock
         return np.sqrt(np.maximum(seen / np.maximum(every, np.finfo(float).tiny), 1.0))
-
-    @property
-    def records_test(self) -> Measurement:
-        """The channels without their delays."""
-        return without_delays(self.still, self.delays[self.clocks])
 
     def step(self, damping: float = 0.0, *, held: bool = False) -> tuple[Array, Array, Array]:
         """A damped step of poles and delays, and the covariance of the latter; zero for those that nothing tells.
@@ -395,17 +385,12 @@ def _agrees(end: _Late, found: Delays, share: float = 0.2) -> bool:
 
     Up to this share, or what noise leaves open beside that term, which must not hide them.
     """
-    beside = _Late(
-        end.still, end.clocks, end.delays, end.poles, complex_residues=end.complex_residues, rising=True
-    )  # fmt: skip
+    beside = _Late(end.still, end.clocks, end.delays, end.poles, end.complex_residues, rising=True)
     _, step, covariance = beside.step()
-    late, std = found.values != 0, np.sqrt(np.diag(covariance))
-    off = np.abs(end.delays + step - found.values)[late]
-    open_ = most_deviations(late.sum()) * std[late]
-    return bool(
-        np.all(off < np.maximum(share * np.abs(found.values[late]), open_))
-        and np.all(open_ < np.abs(found.values[late]))
-    )
+    late = found.values != 0
+    size, std = np.abs(found.values[late]), np.sqrt(np.diag(covariance)[late])
+    off, possible = np.abs(end.delays + step - found.values)[late], most_deviations(int(late.sum())) * std
+    return bool(np.all(off < np.maximum(share * size, possible)) and np.all(possible < size))
 
 
 def least_delay(test: Measurement) -> float:

@@ -117,11 +117,11 @@ def test_descent_is_the_slope_of_what_is_left_with_residues_free(whole, complex_
     test = record(LATE[0]) if whole else spectra(LATE[0])
     beside = beside_poles(test)
     still, clocks, delays = _joined(beside.test), _clocks(test), 1e-4 * np.arange(5.0)
-    at = _Late.on(still, clocks, delays, beside.at.poles, complex_residues)
+    at = _Late(still, clocks, delays, beside.at.poles, complex_residues)
     m, h = beside.at.poles.size, 1e-6
 
     def left(poles, delays):
-        return np.sum((_Late.on(still, clocks, delays, poles, complex_residues).left / at.level) ** 2) / 2
+        return np.sum((_Late(still, clocks, delays, poles, complex_residues).left / at.level) ** 2) / 2
 
     for k in range(5):
         step = h * np.eye(5)[k]

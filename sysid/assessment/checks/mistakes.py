@@ -318,15 +318,13 @@ def _late(test: Measurement, delays: Delays) -> Iterator[Finding]:
     certain = np.argsort(-np.abs(delays.values) / np.where(delays.values != 0, delays.std, 1.0), kind="stable")
     for channel in certain[: 1 if delays.of_base else np.count_nonzero(delays.values)]:
         delay, std = float(delays.values[channel]), float(delays.std[channel])
-        who, whom, key = names[channel], "the base", f"delay = {delay:.3g} for this channel"
-        if delays.of_base:
-            who, whom, key = "the base", "all other channels", f"delay = {-delay:.3g} for the base"
+        who, whom = ("the base", "all other channels") if delays.of_base else (names[channel], "the base")
         word = "early" if (delay < 0) != delays.of_base else "late"
         yield Finding(
             "late sensor", Severity.NOTE,
             f"{who} is recorded {1e3 * abs(delay):.4g} ms {word} against {whom} (standard deviation {1e3 * std:.1g} "
             "ms), as by a clock or a filter of its own; that is taken off before anything else is judged",
-            f"bring the records to one clock, or state {key} (s) in the test's description",
+            "bring the records to one clock (sysid.resample), or filter all channels alike",
             channel=None if delays.of_base else who, numbers={"delay": delay, "std": std},
         )  # fmt: skip
 
