@@ -22,7 +22,7 @@ from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge, with_stated_masses
-from sysid.search.auto import InTurn, check_local_phase, check_strategy, choose, robust_fit
+from sysid.search.auto import InTurn, check_local_phase, check_strategy, choose, robust_fit, within_tolerances
 from sysid.search.session import DeferredInterrupt, Journal, Progress, Session, limits_of, listeners_of, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
@@ -106,6 +106,7 @@ def identify(
             follow = strategy == "auto" and not named
             in_turn = InTurn(prepared.screened, session, start, exchanged_sensors, follow)
             outcome, why = in_turn.run(chosen, why)
+            prepared, outcome = within_tolerances(prepared, outcome, chosen, session)
             outcome = robust_fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)
         outcome = replace(outcome, findings=(*named, *outcome.findings))

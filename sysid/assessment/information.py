@@ -58,19 +58,35 @@ def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Arr
     return A
 
 
-def gain_gradients(modes: Modes, index: Index, rigid_body: Array, grams: Iterator[Array]) -> Array:
-    """``Re J' W y`` over theta, y the motion ``G u + a`` of one sensor alone, (size of theta, n_sensors).
+def gain_gradients(modes: Modes, index: Index, direct: list[Array], grams: list[Iterator[Array]]) -> Array:
+    """``Re J' W y`` over theta, y what a relative error of one of each gain makes of all records.
 
-    So far the fit is pulled by a relative error of that sensor's gain; parameters as in `information`.
+    (size of theta, n_sensors + 2 d): of the sensors' gains, of the base's, by which all records are less of what they
+    are taken to be, and of the force's. `direct` are motion and force beside the modes, (n_sensors, d) and (d, d);
+    `grams` as in `information`.
     """
     phi, gamma = modes.phi, modes.gamma
     (s, m), d = phi.shape, gamma.shape[1]
-    pulls = np.zeros((index.size, s))
+    pulls, mode = np.zeros((index.size, s + 2 * d)), mode_of_slopes(m, d)
     common = np.arange(index.gamma.start, index.log_ratios.stop)
-    for i, gram in enumerate(grams):
-        at = np.concatenate([np.arange(i * m, (i + 1) * m), common])
-        factor = np.concatenate([np.ones(m), np.repeat(phi[i], d), phi[i], phi[i]])
-        pulls[at, i] = factor * (gram[: at.size, :m] @ phi[i] + gram[: at.size, -d:] @ rigid_body[i])
+    for kind, (parts, of_record) in enumerate(zip(direct, grams, strict=False)):
+        first = (s + d) * kind
+        for i, gram in enumerate(of_record):
+            shape, at = (gamma[:, i] if kind else phi[i]), common
+            whole = np.concatenate([shape, np.zeros(mode.size), parts[i]])  # the record, by the spectra
+            of_base = np.zeros((whole.size, d))
+            by_mode = of_base[m : m + m * d].reshape(m, d, d)
+            by_mode[:, np.arange(d), np.arange(d)] = -shape[:, None]
+            by_mode *= gamma[..., None]
+            of_base[-d:] = -np.diag(parts[i])
+            made = gram @ np.column_stack([whole, of_base])
+            if kind:
+                at, made = np.concatenate([common, index.rigid]), force_columns(gamma, index, i).T @ made
+            else:
+                at = np.concatenate([np.arange(i * m, (i + 1) * m), common])
+                made = np.concatenate([np.ones(m), shape[mode]])[:, None] * made[: at.size]
+            pulls[at, first + i] += made[:, 0]
+            pulls[at, s : s + d] += made[:, 1:]
     return pulls
 
 

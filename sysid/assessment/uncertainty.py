@@ -55,6 +55,7 @@ from sysid.models.unknowns import by_name, split
 from sysid.problem.direct_response import Slopes, slopes_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
+from sysid.problem.terms import TestTerm
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
 
@@ -231,13 +232,14 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     own = np.isin(modes.omega, separated_modes(structure).omega)
     possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
-    normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
+    normals = np.hstack([normals, (shifts[:, : possible.size] * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     normals, coupling, coupled = _coupled(
         couplings, own, inflation * np.sqrt(problem.modal[0].scattered or 1.0), normals, unseen
     )
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
+    shifts = shifts[:, : possible.size]
     mine = modes.at(own)
     changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
     matrices = [moves.std(change, size) for change, size in changes]
@@ -280,12 +282,12 @@ def moves_by_records(
 ) -> tuple[Modes, Index, float, Array, Array, Array, Coupling | None]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
-    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it. At last
-    the couplings of these modes by dampers, and how they move.
+    Of gains within tolerances too, as normals. With `gains` also what an error of one of each gain makes of theta, in
+    columns as in `Gains.moves`; none without it. At last the couplings of these modes by dampers, and how they move.
     """
     modal, modes = problem.modal[0], _all_modes(structure)
     if modal.by_modes and modal.omega.size != modes.omega.size:  # residual modes of other numbers: by the lines
-        modal = ModalEstimate.of_lines(modal.records)
+        modal = replace(ModalEstimate.of_lines(modal.records), calibration=modal.calibration)
     if modal.by_modes and modal.static:  # which turns change nothing holds where their information was taken
         at = slice(-modal.static, None)
         modes.phi[:, at], modes.gamma[at] = modal.phi[:, at], modal.gamma[at]
@@ -308,14 +310,18 @@ def moves_by_records(
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns, modal.scattered)
     shifts = np.zeros((index.size, 0))
-    if gains:
+    if gains or modal.calibration is not None:
         if spectra is not None:
-            pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
+            direct = [test.rigid_body, structure.rigid_body_mass]
+            pulls = gain_gradients(modes, index, direct, [record.grams(spectra) for record in records])
         else:
             pulls = A @ shifts_about(modal, modes)
         plain = normals if B is None else spread(A, None, path)[0]
         shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
-    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts, found
+    normals = (1.0 if np.isnan(inflation) else inflation) * normals
+    if modal.calibration is not None:
+        normals = np.hstack([normals, shifts @ modal.calibration.moves])
+    return modes, index, inflation, normals, unseen, shifts, found
 
 
 def _coupling_of(structure: Structure) -> Array:
@@ -332,7 +338,7 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = sensitivity(formulation, x, slopes)
-    shifts: Array = np.zeros((x.size, test.n_sensors))
+    shifts: Array = np.zeros((x.size, test.n_sensors + 2 * test.n_base))
     if formulation.fits_records:
         known, shifts = _with_gains(formulation, x, slopes, known)
     steps, count = known.steps, known.normals.shape[1]
@@ -348,7 +354,7 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
     for matrix, slope in blocks_and_slopes(structure, slopes):
         size = np.sqrt(np.abs(np.diag(matrix)))
         matrices.append(std_of(slope @ steps, count, np.outer(size, size)))
-    by_gain = np.abs(np.einsum("iic,cs->si", slopes.mass, shifts))
+    by_gain = np.abs(np.einsum("iic,cs->si", slopes.mass, shifts[:, : test.n_sensors]))
     spectra: ModalSpectra | DirectSpectra = ModalSpectra(modes, moves, structure.rigid_body_mass)
     if not structure.modal_damping:
         spectra = DirectSpectra(slopes, steps, count)
@@ -357,27 +363,42 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
 
 
 def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensitivity) -> tuple[Sensitivity, Array]:
-    """Add to the moves of x those that make up for an error that a sensor's gain may have (`GainErrors.possible`).
+    """Add to the moves of x those that make up for errors of gains: within tolerances, or `GainErrors.possible`.
 
-    And what an error of one of each gain makes of x, (size of x, n_sensors).
+    And what an error of one of each gain makes of x, (size of x, n_sensors + 2 d).
     """
-    term, structure = formulation.own_test, slopes.structure
-    test = term.test
-    possible = gain_errors(term.estimate, structure).possible
-    rows = term.rows_of(slopes, x.size)[0]
-    weight, scale = weights_of_test(test, weighted=True)[0]
-    whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
-    size = term.weight * weight / scale * whole
-    if len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
-        factor = term.weight / scale * independent_rows(term.estimate)[0]
-        pull = rows.jacobian.T @ (factor @ term.estimate.gain.moves)
-    else:
-        pulls = rows.jacobian.reshape(2, *size.shape, -1)
-        pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
+    estimate = formulation.own_test.estimate
+    possible = gain_errors(estimate, slopes.structure).possible
     inverse = known.unit[:, None] * known.seen / known.singular_values[: known.rank]
-    shifts = inverse @ (inverse.T @ pull)
-    normals = np.hstack([known.normals, (shifts * possible)[:, possible > 0]])
-    return replace(known, normals=normals), shifts
+    shifts = inverse @ (inverse.T @ _pulled_by_gains(formulation.own_test, slopes, x.size))
+    moves = [known.normals, (shifts[:, : possible.size] * possible)[:, possible > 0]]
+    if estimate.calibration is not None:
+        moves.append(shifts @ estimate.calibration.moves)
+    return replace(known, normals=np.hstack(moves)), shifts
+
+
+def _pulled_by_gains(term: TestTerm, slopes: Slopes, size: int) -> Array:
+    """``J' W y``, y what an error of one of each gain makes of the records, (size, n_sensors + 2 d): see `Gains`."""
+    test, structure, (n, d) = term.test, slopes.structure, term.test.rigid_body.shape
+    rows, weights = term.rows_of(slopes, size), weights_of_test(test, weighted=True)
+    whole = structure.relative_acceleration(test.freq) + test.rigid_body[..., None]
+    spectra = [whole, structure.base_force(test.freq)][: len(weights)]
+    pull = np.zeros((size, n + 2 * d))
+    if len(rows[0].jacobian) != 2 * n * test.n_runs * test.freq.size:  # rows of modes in place of those of lines
+        factor = term.weight / weights[0][1] * independent_rows(term.estimate)[0]
+        return np.asarray(rows[0].jacobian.T @ (factor @ term.estimate.gain.moves))
+    for first, row, (weight, scale), H in zip((0, n + d), rows, weights, spectra, strict=False):
+        by_base = np.stack([columns(one) for one in np.einsum("cdf,rdf->drcf", H, test.base)])
+        by_base = term.weight * weight / scale * by_base  # (d, channels, runs * n_freq)
+        real, imaginary = row.jacobian.reshape(2, *by_base.shape[1:], -1)
+        of_channel = np.sum(by_base, axis=0)
+        pull[:, first : first + len(H)] = np.einsum("clp,cl->pc", real, of_channel.real) + np.einsum(
+            "clp,cl->pc", imaginary, of_channel.imag
+        )
+        pull[:, n : n + d] -= np.einsum("clp,dcl->pd", real, by_base.real) + np.einsum(
+            "clp,dcl->pd", imaginary, by_base.imag
+        )
+    return pull
 
 
 def _with_unknowns(

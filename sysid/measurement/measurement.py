@@ -14,15 +14,13 @@ from sysid.errors import (
     as_float,
     check_frequencies,
     choice,
-    flag,
-    instance,
     numbers,
-    random_generator,
     refuse,
     sequence,
     whole_number,
 )
 from sysid.measurement import spectra
+from sysid.measurement.gains import tolerances
 from sysid.measurement.spectra import Missing, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
@@ -73,6 +71,9 @@ class Measurement:
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
     sample_rate : float, optional
         Hz; of the plain spectra of whole records, in m/s² s, that `from_time` gives with the estimator "spectra".
+    gain_std, base_gain_std, force_gain_std : array_like, optional
+        Tolerances: standard deviations of the relative error of each gain, of the sensors (n_sensors,), of the base's
+        (d,) and of the force's (d,); one number is that of all. Exact where none is stated.
 
     Notes
     -----
@@ -95,6 +96,9 @@ class Measurement:
     averaged: bool = field(default=False, kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     sample_rate: float | None = field(default=None, kw_only=True)
+    gain_std: Array | None = field(default=None, kw_only=True)
+    base_gain_std: Array | None = field(default=None, kw_only=True)
+    force_gain_std: Array | None = field(default=None, kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -135,6 +139,8 @@ class Measurement:
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
+        for name, count in (("gain_std", sensors), ("base_gain_std", d), ("force_gain_std", d)):
+            put(name, tolerances(name, getattr(self, name), count))
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -144,7 +150,8 @@ class Measurement:
             "force_std": self.force_std, "base_axes": self.base_axes,
             "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
             "averaged": self.averaged, "whole": self.whole and self.whole.to_tree(),
-            "sample_rate": self.sample_rate,
+            "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
+            "force_gain_std": self.force_gain_std,
         }  # fmt: skip
 
     @classmethod
@@ -286,6 +293,7 @@ class Measurement:
         return replace(
             self, response=self.response[:, keep], rigid_body=self.rigid_body[keep],
             response_std=None if std is None else std[:, keep], whole=whole and whole.of_sensors(keep),
+            gain_std=None if self.gain_std is None else self.gain_std[keep],
             sensors=sensors and tuple(sensors[i] for i in np.flatnonzero(keep)),
         )  # fmt: skip
 
@@ -442,57 +450,3 @@ def _std(name: str, value: Any, record: ComplexArray | None, read: Callable[...,
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
     return full
-
-
-def simulate(
-    structure: Structure,
-    freq: ArrayLike,
-    *,
-    noise: float = 0.0,
-    force: bool = False,
-    rng: int | np.random.Generator | None = None,
-    base_axes: str | Sequence[str] | None = None,
-) -> Measurement:
-    """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
-
-    Parameters
-    ----------
-    structure : Structure
-    freq : array_like, shape (n_freq,)
-        Hz.
-    noise : float
-        Circular complex noise with ``E|e|² = noise² mean|record|²``, the mean taken over all runs,
-        channels and lines; responses and force apart.
-    force : bool
-        Record the base force too.
-    rng : int, numpy Generator or None
-    base_axes : str or sequence of str, optional
-        Names of the base directions, as in `Measurement`.
-
-    Returns
-    -------
-    Measurement
-        Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
-        ``measurement.residual(structure)``.
-    """
-    instance("structure", structure, Structure)
-    noise = as_float("noise", noise, "a finite fraction >= 0", at_least=0)
-    lines = check_frequencies(freq)
-    random = random_generator(rng)
-    response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
-    base_force = force_std = None
-    if flag("force", force):
-        base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
-    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
-    return Measurement(
-        lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
-        force=base_force, response_std=response_std, force_std=force_std, **options,
-    )  # fmt: skip
-
-
-def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
-    if noise == 0:
-        return record, None
-    std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
-    error = random.standard_normal(record.shape) + 1j * random.standard_normal(record.shape)
-    return record + error * std / np.sqrt(2), np.array(std)

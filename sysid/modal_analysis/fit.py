@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, Stop
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -238,7 +239,10 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
     return out
 
 
-def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMonitor | None = None) -> ModalEstimate:
+def fit_modes(
+    test: Measurement, delays: Delays | None = None, calibration: Calibration | None = None, *,
+    monitor: FitMonitor | None = None,
+) -> ModalEstimate:  # fmt: skip
     """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
@@ -246,6 +250,8 @@ def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMo
     test : Measurement
     delays : Delays, optional
         Of its sensors and force, which are taken off: see `find_delays`. None where they are not asked for.
+    calibration : Calibration, optional
+        Errors of its gains, which are taken off; by default what is stated of them alone.
     monitor : FitMonitor, optional
 
     Raises
@@ -253,12 +259,23 @@ def fit_modes(test: Measurement, delays: Delays | None = None, *, monitor: FitMo
     InputError, Stop, KeyboardInterrupt
         As `whole_fit` does.
     """
-    values = None if delays is None else delays.values
+    values, calibration = None if delays is None else delays.values, calibration or Calibration.stated(test)
+    test = test if calibration is None else calibration.taken_off(test)
     if test.whole is None:
         turned = test if values is None else without_delays(test, values)
-        return replace(ModalEstimate.of_lines(turned), delays=delays)
+        return replace(ModalEstimate.of_lines(turned), delays=delays, calibration=calibration)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        return estimate(whole_fit(test, values, monitor=monitor))
+        return estimate(whole_fit(test, values, monitor=monitor), calibration)
+
+
+def calibrated(modal: ModalEstimate, calibration: Calibration, monitor: FitMonitor) -> ModalEstimate:
+    """The estimate of a test from which nothing was taken off yet, without these errors of its gains."""
+    fit = modal.record_fit
+    if fit is None:
+        turned = ModalEstimate.of_lines(calibration.taken_off(modal.records))
+        return replace(turned, delays=modal.delays, calibration=calibration)
+    with one_thread():
+        return estimate(on_turned(fit, calibration.taken_off(fit.test), monitor=monitor), calibration)
 
 
 def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
@@ -299,7 +316,7 @@ def without_transients(fit: RecordFit) -> Measurement:
 
 
 @one_thread()
-def estimate(fit: RecordFit) -> ModalEstimate:
+def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEstimate:
     """Modes in ascending order, with their information: the same bits where a stored fit is read."""
     modes, p, index = fit.parameters.modes, fit.parameters, fit.model.index
     order = np.argsort(modes.omega, kind="stable")
@@ -317,6 +334,6 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
-        delays=delays_of(fit),
+        delays=delays_of(fit), calibration=calibration,
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

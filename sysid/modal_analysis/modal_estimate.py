@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
 from sysid.modal_analysis.record_fit import RecordFit
@@ -25,9 +26,10 @@ from sysid.structure.thresholds import ROUND_OFF, round_off
 class Gains:
     """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations.
 
-    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order;
-    `rigid` (n_sensors, d) the share of the base's motion in each sensor beside what its row of G says, as a wrong sign,
-    axis or gain makes it, and `rigid_chi2` (n_sensors,) how far it stands out, with d degrees of freedom.
+    `moves` (p, n_sensors + 2 d) is what an error of one of each gain makes of the fitted modal parameters, to first
+    order: of the sensors', then of the base's and of the force's in each direction. `rigid` (n_sensors, d) is the share
+    of the base's motion in each sensor beside what its row of G says, as a wrong sign, axis or gain makes it, and
+    `rigid_chi2` (n_sensors,) how far it stands out, with d degrees of freedom.
     """
 
     error: Array
@@ -98,7 +100,7 @@ class ModalEstimate:
     Attributes
     ----------
     given : Measurement
-        The test as it was given, without its delays.
+        The test as it was given, without its delays and errors of gains.
     records : Measurement
         What is fitted: whole records as they would be at rest at both ends, their noise stated; others as given.
     phi : (n_sensors, m)
@@ -145,6 +147,8 @@ class ModalEstimate:
         Of modes that dampers couple, where a force was measured; None where the damping is classical.
     delays : Delays or None
         Taken off sensors and force; None where none were asked for.
+    calibration : Calibration or None
+        Errors of gains that were taken off, and what tolerances leave of them; None where all gains are exact.
     """
 
     given: Measurement
@@ -171,12 +175,13 @@ class ModalEstimate:
     record_fit: RecordFit | None = None
     coupling: Coupling | None = None
     delays: Delays | None = None
+    calibration: Calibration | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
         """That of a test whose lines stand for themselves."""
         (n, d), none, unknown = test.rigid_body.shape, np.zeros(0), np.full(test.n_sensors, np.nan)
-        gain = Gains(unknown, unknown, 1, np.zeros((0, n)), np.zeros((n, d)), np.zeros(n))
+        gain = Gains(unknown, unknown, 1, np.zeros((0, n + 2 * d)), np.zeros((n, d)), np.zeros(n))
         return cls(
             test, test, np.zeros((n, 0)), np.zeros((0, d)), none, none, np.eye(d), np.zeros((0, 0)), None, 1.0,
             np.zeros(test.n_runs), gain,
@@ -302,7 +307,7 @@ def information_about(estimate: ModalEstimate, modes: Modes) -> tuple[Array, Arr
 
 
 def shifts_about(estimate: ModalEstimate, modes: Modes) -> Array:
-    """Shifts of the parameters by an error of one of each sensor's gain, in the scale and sign of `modes`."""
+    """Shifts of the parameters by an error of one of each gain, in the scale and sign of `modes`."""
     return estimate.gain.moves / _scale_of(estimate, modes)[:, None]
 
 

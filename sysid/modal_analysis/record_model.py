@@ -341,10 +341,11 @@ class Chunk(Lines):
                 column = model.n_fit + (kind * n + channel) * d + beside
                 yield column, last + traces.size + (kind - 1) * d + beside, np.ones(d)
 
-    def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
-        """Products of the spectra of these lines with the errors alone."""
+    def sums_of_errors(self, levels: Array, columns: Columns, error: ComplexArray | None = None) -> Sums:
+        """Products of the spectra of these lines with the errors alone, or with others (c, L)."""
         weighed = self.weighed(levels)
-        cross = dots(self.spectra(weighed.base), self.run.weight * weighed.whitened_residual)
+        left = weighed if error is None else self.weighed(levels, error)
+        cross = dots(self.spectra(weighed.base), self.run.weight * left.whitened_residual)
         return Sums(np.zeros((0, 0)), cross, np.zeros((0, 0)), float(self.run.weight @ weighed.power))
 
     def sums(self, levels: Array, columns: Columns) -> Sums:
@@ -377,10 +378,11 @@ class CoupledChunk(Chunk):
         """See `Chunk`."""
         return Summed(np.arange(self.records.size), [])
 
-    def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
+    def sums_of_errors(self, levels: Array, columns: Columns, error: ComplexArray | None = None) -> Sums:
         """See `Chunk`."""
         weighed, none = self.weighed(levels), np.zeros((0, 0))
-        weights = (self.run.weight * weighed.whitened_residual).conj()
+        left = weighed if error is None else self.weighed(levels, error)
+        weights = (self.run.weight * left.whitened_residual).conj()
         gradient = self._seen(weights, *self._parts(weighed.base)).real.sum(axis=1)
         return Sums(none, gradient, none, float(self.run.weight @ weighed.power))
 

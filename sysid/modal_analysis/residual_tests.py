@@ -308,18 +308,35 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
     plain_std = np.hypot(plain_std, plain - error)
     better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
-    # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
-    # linear in it take the factor, and G u beside them pulls the fit.
-    half = half_inverse(normal[:at, :at], ROUND_OFF)
-    pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
-    moves = np.zeros((fit.model.index.size, n))
-    moves[: fit.model.kept] = pulled[: fit.model.kept]
-    by_sensor = moves[fit.model.index.phi].reshape(n, -1, n)
-    by_sensor[np.arange(n), :, np.arange(n)] += fit.parameters.modes.phi
     rigid, chi2 = _rigid(fit, beyond)
+    moves = _moves_by_gains(fit, half_inverse(normal[:at, :at], ROUND_OFF) / size[:at, None])
     return Gains(
         np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
     )  # fmt: skip
+
+
+def _moves_by_gains(fit: RecordFit, half: Array) -> Array:
+    """See `Gains`; ``half half'`` is the inverse of the normal matrix of the fit.
+
+    A sensor that reads too much records `1 + error` times all its motion, transients included. Of a base that does, all
+    records are that much less of what they are taken to be.
+    """
+    model, p, (n, d) = fit.model, fit.parameters, fit.test.rigid_body.shape
+    pulls = np.zeros((n + 2 * d, model.size))
+    columns = {run.piece: model.chunk(p, run.at(slice(0, 1))).columns() for run in model.runs}
+    for chunk in model.chunks(p):
+        channels, base = chunk.predicted(chunk.run.base, chunk.motion), chunk.run.base
+        at = columns[chunk.run.piece]
+        errors = {i: np.outer(np.arange(len(channels)) == i, 1.0) * row for i, row in enumerate(channels)}
+        of_force = {n + d + i - n: error for i, error in errors.items() if i >= n}
+        of_base = {n + j: -chunk.H[:, j] * base[j] for j in range(d)}
+        for gain, error in {**{i: errors[i] for i in range(n)}, **of_base, **of_force}.items():
+            products = at.products(chunk.sums_of_errors(fit.levels, at, error), chunk.deviations(fit.levels)[0])
+            pulls[gain, at.unknowns] += products.gradient
+    moved = half @ (half.T @ pulls.T)
+    moves = np.zeros((model.index.size, n + 2 * d))
+    moves[: model.kept] = moved[: model.kept]
+    return moves
 
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:

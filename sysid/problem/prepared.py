@@ -16,6 +16,7 @@ from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.calibration import Calibration, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -139,16 +140,18 @@ class Prepared(SearchSpace):
     """Statements of a user, and the modal estimate of each fitted test: what strategies search and checks judge.
 
     `modal` are the estimates of the tests, the problem's own first, found when first asked for where none are given;
-    `delays` of the tests, and `fits` of whole records, are what they are then made of. With `in_squares` squares are
-    fitted, whatever loss is stated.
+    `delays` and `calibrations` of the tests, and `fits` of whole records, are what they are then made of. With
+    `in_squares` squares are fitted, whatever loss is stated.
     """
 
     def __init__(
         self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False,
         delays: Sequence[Delays | None] = (), fits: Sequence[RecordFit | None] = (),
+        calibrations: Sequence[Calibration | None] = (),
     ) -> None:  # fmt: skip
         self.stated, self.in_squares = stated, in_squares or stated.loss == "squares"
-        self._fits = tuple(fits) or (None,) * len(stated.tests)
+        none = (None,) * len(stated.tests)
+        self._fits, self._calibrations = tuple(fits) or none, tuple(calibrations) or none
         if delays:
             self.delays = tuple(delays)
         if modal:
@@ -179,12 +182,16 @@ class Prepared(SearchSpace):
     def from_tree(cls, stated: StatedProblem, tree: dict[str, Any]) -> Prepared:
         """Make what `to_tree` made a tree of, with the fits of its whole records."""
         tests, delays = stated.tests, stored_delays(tree, stated.tests)
+        calibrations = stored_calibrations(tree, tests)
         fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
         read = [
-            fit and RecordFit.from_tree(fit, without_delays(test, late.values))
-            for fit, test, late in zip(fits, tests, delays, strict=True)
+            fit
+            and RecordFit.from_tree(
+                fit, without_delays(calibration.taken_off(test) if calibration else test, late.values)
+            )
+            for fit, test, late, calibration in zip(fits, tests, delays, calibrations, strict=True)
         ]
-        return cls(stated, delays=delays, fits=read)
+        return cls(stated, delays=delays, fits=read, calibrations=calibrations)
 
     @cached_property
     def delays(self) -> tuple[Delays | None, ...]:
@@ -200,8 +207,10 @@ class Prepared(SearchSpace):
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
         return tuple(
-            fit_modes(test, delays) if fit is None else estimate(fit)
-            for test, delays, fit in zip(self.stated.tests, self.delays, self._fits, strict=True)
+            fit_modes(test, delays, calibration) if fit is None else estimate(fit, calibration)
+            for test, delays, calibration, fit in zip(
+                self.stated.tests, self.delays, self._calibrations, self._fits, strict=True
+            )
         )
 
     def fit_lines(
@@ -235,7 +244,7 @@ class Prepared(SearchSpace):
         if count is not None:
             more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
-            self.modal = (estimate(more), *self.modal[1:])
+            self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
 
     @property
     def answers_in_band(self) -> bool:
@@ -330,7 +339,11 @@ class Prepared(SearchSpace):
 
     def of_lines(self, tests: Iterable[Measurement]) -> Prepared:
         """The problem in squares with other tests, whose lines stand for themselves."""
-        return Prepared(self.stated, [ModalEstimate.of_lines(test) for test in tests], in_squares=True)
+        modal = [
+            replace(ModalEstimate.of_lines(test), calibration=one.calibration)
+            for test, one in zip(tests, self.modal, strict=False)
+        ]
+        return Prepared(self.stated, modal, in_squares=True)
 
     # -- what is searched --------------------------------------------------------------------------
 
@@ -469,4 +482,6 @@ class Prepared(SearchSpace):
         poles = self.geometry.found if given else None
         fits = [one.record_fit and one.record_fit.to_tree() for one in self.modal]
         delays = [None if one.delays is None else one.delays.to_tree() for one in self.modal]
-        return {**self.stated.to_tree(), "poles": poles and asdict(poles), "fits": fits, "delays": delays}
+        gains = [None if one.calibration is None else one.calibration.to_tree() for one in self.modal]
+        found = {"poles": poles and asdict(poles), "fits": fits, "delays": delays, "calibrations": gains}
+        return {**self.stated.to_tree(), **found}

@@ -122,6 +122,7 @@ class StatedProblem:
             "poles": None,
             "fits": [],
             "delays": [],
+            "calibrations": [],
             "reference": self.reference and self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,

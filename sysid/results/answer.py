@@ -198,8 +198,10 @@ class Answer:
         part = self.part
         if part is None:
             return self.prepared.modal
-        fit = part.records.fit
-        return (fit_modes(part.records.measurement, part.records.delays) if fit is None else estimate(fit),)
+        fit, calibration = part.records.fit, part.records.calibration
+        if fit is not None:
+            return (estimate(fit, calibration),)
+        return (fit_modes(part.records.measurement, part.records.delays, calibration),)
 
     @cached_property
     def fitted(self) -> ModalEstimate:

@@ -13,6 +13,7 @@ from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.calibration import Calibration, stored_calibrations
 from sysid.modal_analysis.delays import Delays, stored_delays
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
@@ -166,6 +167,7 @@ class StoredRecords:
     goal: float | None
     loss: str
     delays: Delays
+    calibration: Calibration | None
     fit: RecordFit | None
     """Of whole records, which the file holds."""
 
@@ -173,7 +175,8 @@ class StoredRecords:
     def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
         test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
-        (delays,) = stored_delays(tree, [test])
+        (delays,), (calibration,) = stored_delays(tree, [test]), stored_calibrations(tree, [test])
+        on_clock = without_delays(calibration.taken_off(test) if calibration else test, delays.values)
         return cls(
             test,
             None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
@@ -181,7 +184,8 @@ class StoredRecords:
             tree["goal"],
             tree["loss"],
             delays,
-            None if fits[0] is None else RecordFit.from_tree(fits[0], without_delays(test, delays.values)),
+            calibration,
+            None if fits[0] is None else RecordFit.from_tree(fits[0], on_clock),
         )
 
 

@@ -1,7 +1,8 @@
-"""The strategies by their names, "auto", and the rounds of Huber's loss after any of them.
+"""The strategies by their names, "auto", and what follows any of them: gains, and rounds of Huber's loss.
 
-"auto" takes the first strategy that applies, and those after it while there is no good fit. Huber's loss is least
-squares of pseudo-values, again and again from the last answer, until it stays.
+"auto" takes the first strategy that applies, and those after it while there is no good fit. Errors of gains that are
+likely beside stated tolerances are read off its answer and taken off the records, which are fitted once more. Huber's
+loss is least squares of pseudo-values, again and again from the last answer, until it stays.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sysid.assessment.checks.gains import gain_errors
 from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
+from sysid.modal_analysis.fit import calibrated
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
@@ -129,6 +132,33 @@ class InTurn:
         return replace(first, success=False, message=str(second.stopped) or "interrupted", stopped=second.stopped)
 
 
+_GAINS = "gains within tolerances"  # the phase of the fit without their errors
+
+
+def within_tolerances(
+    problem: Prepared, end: Outcome, strategy: Strategy, session: Session
+) -> tuple[Prepared, Outcome]:
+    """The problem and where its search ended, without the errors of gains that records and tolerances make likely."""
+    stated = problem.stated
+    if end.stopped is not None or problem.stopped or not any(one.calibration for one in problem.modal):
+        return problem, end
+    modal = list(problem.modal)
+    try:
+        with session.fit_monitor() as monitor:
+            for at, (one, its) in enumerate(problem.screened.fits(end.structure, end.x), start=problem.first_test - 1):
+                if one.calibration is not None:
+                    found = gain_errors(one, its)
+                    likely = one.calibration.given(one.records, found.error, found.std)
+                    modal[at] = calibrated(modal[at], likely, monitor)
+        other = Prepared(stated, modal, in_squares=problem.in_squares)
+        again = _fitted(other.screened, end, strategy, session)
+    except (Stop, KeyboardInterrupt) as stop:
+        return problem, _cut_short(end, str(stop) or "interrupted", stop)
+    except (InputError, SolverError) as error:
+        return problem, _cut_short(end, f"the fit without errors of gains came to nothing: {error}")
+    return other, _with_round(other.screened, replace(end, findings=again.findings), again, session, _GAINS)
+
+
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
 
 
@@ -172,14 +202,14 @@ def check_local_phase(problem: Prepared, strategy: Strategy) -> None:
         raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
 
 
-def _with_round(problem: Prepared, end: Outcome, again: Outcome, session: Session) -> Outcome:
+def _with_round(problem: Prepared, end: Outcome, again: Outcome, session: Session, name: str = HUBER) -> Outcome:
     """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
     left = objective_of(problem, again.structure, again.x)
     curve = np.concatenate([end.history.local_curve, again.history.local_curve])
-    phases = [phase for phase in end.history.phases if phase.name != HUBER]
-    before = sum(phase.evaluations for phase in end.history.phases if phase.name == HUBER)
+    phases = [phase for phase in end.history.phases if phase.name != name]
+    before = sum(phase.evaluations for phase in end.history.phases if phase.name == name)
     x = np.zeros(0) if again.x is None else again.x
-    phases.append(Phase(HUBER, left, x, session.seconds, before + again.history.local_curve.size))
+    phases.append(Phase(name, left, x, session.seconds, before + again.history.local_curve.size))
     history = replace(end.history, local=left, local_curve=curve, phases=tuple(phases))
     return replace(again, findings=end.findings, history=history)
 

@@ -9,7 +9,7 @@ nothing is told but that (`modes_below`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -17,17 +17,20 @@ from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
+from sysid.measurement.gains import seen_at_sensors, tolerance_of
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gains_and_slopes, modes_above
 from sysid.problem.prepared import Prepared
+from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
 _UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_DRIVEN = 0.5  # of a sensor's motion with the base, along one of its directions
 _BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors, as poles follow it
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
 NUMBERS_A_RESIDUE = 2  # times the free residues: fewer numbers than these tell nothing beside noise
@@ -40,36 +43,42 @@ class GainErrors:
     Attributes
     ----------
     error, std : (n_sensors,)
-        Of the gain, as a fraction, and its standard deviation; NaN where the records cannot show it: the sensor's
-        row of G is zero, or modes answer like a constant.
+        Of the gain against the base's, as a fraction, and its standard deviation; NaN where the records cannot show it:
+        the sensor's row of G is zero, or modes answer like a constant.
     possible : (n_sensors,)
-        Error that the gain may well have, though it may be chance; zero where nothing speaks for one.
+        Error that the gain may well have, though it may be chance; zero where nothing speaks for one, or a tolerance is
+        stated, which then stands for it.
     freedom : int
         Degrees of freedom of the standard deviations.
+    tolerance : (n_sensors,)
+        Standard deviation of the gain against the base's that is stated; zero where both are exact.
     """
 
     error: Array
     std: Array
     possible: Array
     freedom: int
+    tolerance: Array
 
     @property
     def wrong(self) -> NDArray[np.intp]:
         """Sensors whose gain is wrong beyond chance and by more than is usual, the worst first."""
         known = np.isfinite(self.error)
-        off = np.where(known, np.abs(self.error) / np.where(known, self.std, 1.0), 0.0)
+        off = np.where(known, np.abs(self.error) / np.where(known, np.hypot(self.std, self.tolerance), 1.0), 0.0)
         chance = 2 * scipy.special.stdtr(self.freedom, -off) * np.count_nonzero(known)
         size = np.abs(np.nan_to_num(self.error))
         found = np.flatnonzero((chance < FALSE_ALARM) & (size > max(_LEAST, _BESIDE * size.max())))
         return found[np.argsort(-off[found])]
 
-    @property
-    def of_base(self) -> float | None:
-        """The one error that explains those of all sensors, where three or more show one: then it is the base's."""
-        known = np.isfinite(self.error)
-        if np.count_nonzero(known) < 3 or not self.wrong.size:
+    def of_base(self, driven: NDArray[np.bool_] | None = None) -> float | None:
+        """The one error that explains those of all sensors, or of those `driven` by a base direction, (n_sensors,).
+
+        Where three or more show one, and one of them is wrong by it: then it is the base's.
+        """
+        known = np.isfinite(self.error) & (True if driven is None else driven)
+        if np.count_nonzero(known) < 3 or not np.any(known[self.wrong]):
             return None
-        error, std = self.error[known], self.std[known]
+        error, std = self.error[known], np.hypot(self.std, self.tolerance)[known]
         one = float(np.average(error, weights=std**-2))
         return one if np.all(np.abs(error - one) < most_deviations(error.size) * std) else None
 
@@ -80,17 +89,31 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     Each is estimated twice, beside the modes alone and beside what `modes_above` the lines may add too. The first is
     the more exact, but right only where no mode lies above the lines: by how much the two differ counts among its
     errors. The one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that
-    share it are counted as such; noise that is stated larger counts as stated.
+    share it are counted as such; noise that is stated larger counts as stated. What was taken off the records within
+    stated tolerances is a part of the errors.
     """
+    found, calibration = _shown(modal, structure), modal.calibration
+    if calibration is None:
+        return found
+    H = seen_at_sensors(modal.records)
+    taken, tolerance = H @ calibration.values, np.sqrt(H**2 @ tolerance_of(modal.records) ** 2)
+    return replace(
+        found, error=found.error + taken, tolerance=tolerance, possible=np.where(tolerance > 0, 0.0, found.possible)
+    )
+
+
+def _shown(modal: ModalEstimate, structure: Structure) -> GainErrors:
+    """Those of what is left in the records."""
     test, gain = modal.records, modal.gain
     nothing = np.full(test.n_sensors, np.nan)
-    unknown = GainErrors(nothing, nothing, np.zeros(test.n_sensors), 1)
+    zero = np.zeros(test.n_sensors)
+    unknown = GainErrors(nothing, nothing, zero, 1, zero)
     if below_lines(test, structure).size:
         return unknown
     if modal.of_records:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
-        return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
+        return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom, zero)
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (1 + velocity)
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 3 * test.n_base):
@@ -107,7 +130,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     better = plain_std < std
     error, std = np.where(better, plain, error), np.where(better, plain_std, std)
     freedom = (len(records.data) - free.Q.shape[1] - rising.shape[1]) * (records.data.shape[1] // test.n_sensors)
-    return GainErrors(error, std, possible, freedom)
+    return GainErrors(error, std, possible, freedom, zero)
 
 
 def _beyond(error: Array, std: Array) -> Array:
@@ -160,19 +183,62 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
 
 
 def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
-    """Sensors whose gain is wrong, the worst first."""
-    base = errors.of_base
-    alike = "" if base is None else f", or the base {-100 * base:+.2g} %, as all sensors show the same error"
-    for i in errors.wrong[:MOST_OF_A_KIND]:
+    """Gains that are wrong: of the base, a table that rocks, or single sensors, the worst first."""
+    explained = np.zeros(test.n_sensors, bool)
+    for axis, name in enumerate(test.base_axes):
+        driven = np.abs(seen_at_sensors(test)[:, test.n_sensors + axis]) > _DRIVEN
+        base = errors.of_base(driven)
+        found = list(_rocking(test, errors, axis, driven)) if base is None else [_of_base(name, base, errors, driven)]
+        explained |= driven & bool(found)
+        yield from found
+    for i in [one for one in errors.wrong if not explained[one]][:MOST_OF_A_KIND]:
         error, name = float(errors.error[i]), test.sensor_names[i]
-        numbers = {"gain": 1 + error, "std": float(errors.std[i])} | ({} if base is None else {"base": 1 - base})
         yield Finding(
             "gain", Severity.CONTRADICTS,
             f"{name} reads {100 * abs(error):.2g} % {'high' if error > 0 else 'low'} against the base (standard "
-            f"deviation {100 * errors.std[i]:.1g} %){alike}: M_SS, K_SS and C are wrong in its row and column",
+            f"deviation {100 * errors.std[i]:.1g} %): M_SS, K_SS and C are wrong in its row and column",
             f"calibrate it and divide its record by {1 + error:.4f} (gain = {1 + error:.4f} in sensors.toml), or "
-            "correct its axis or its row of rigid_body", channel=name, numbers=numbers,
+            "correct its axis or its row of rigid_body", channel=name,
+            numbers={"gain": 1 + error, "std": float(errors.std[i])},
         )  # fmt: skip
+
+
+def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.bool_]) -> Finding:
+    """The base reads differently from all sensors that move with it."""
+    gain, std = 1 / (1 + error), float(np.sum(errors.std[driven & np.isfinite(errors.std)] ** -2.0) ** -0.5)
+    return Finding(
+        "gain", Severity.CONTRADICTS,
+        f"the base {name} reads {100 * abs(gain - 1):.2g} % {'high' if gain > 1 else 'low'} against all sensors that "
+        f"move with it (standard deviation {100 * std:.1g} %): M, K and C are wrong by as much",
+        f"calibrate it and divide its record by {gain:.4f} (gain = {gain:.4f} in sensors.toml)", channel=f"base {name}",
+        numbers={"gain": gain, "std": std},
+    )  # fmt: skip
+
+
+def _rocking(test: Measurement, errors: GainErrors, axis: int, driven: NDArray[np.bool_]) -> Iterator[Finding]:
+    """Errors of gains rise with the sensors' places, as a rotation of the table with its motion along an axis makes."""
+    known = driven & np.isfinite(errors.error)
+    if test.sensors is None or np.count_nonzero(known) < 3 or not np.any(known[errors.wrong]):
+        return
+    rows = rigid_body(sensors=test.sensors, base_axes=BASE_AXES)
+    error, std = errors.error[known], np.hypot(errors.std, errors.tolerance)[known]
+    for turn in [name for name in BASE_AXES[3:] if name not in test.base_axes]:
+        arm = rows[known, BASE_AXES.index(turn)] / test.rigid_body[known, axis]
+        size = float(np.sum((arm / std) ** 2))
+        if np.ptp(arm) <= NEGLIGIBLE * np.abs(arm).max(initial=0.0):
+            continue  # as of one error of all
+        slope = float(np.sum(arm * error / std**2)) / size
+        likely = most_deviations(error.size)
+        if np.all(np.abs(error - slope * arm) < likely * std) and abs(slope) * np.sqrt(size) > likely:
+            yield Finding(
+                "table rocks", Severity.CONTRADICTS,
+                f"the sensors' gains against the base {test.base_axes[axis]} rise with their places: your table rocks "
+                f"about {turn[1]} by about {slope:.2g} rad/m (standard deviation {size**-0.5:.1g}) as it moves along "
+                f"{test.base_axes[axis]}",
+                f"record its rotation and state it as a base direction ({turn}), or stiffen its guides",
+                channel=f"base {test.base_axes[axis]}", numbers={"slope": slope, "std": size**-0.5},
+            )  # fmt: skip
+            return
 
 
 def assumed(problem: Prepared) -> Iterator[Finding]:
@@ -180,7 +246,8 @@ def assumed(problem: Prepared) -> Iterator[Finding]:
     test, mass = problem.measurement, problem.formulation.mass
     if mass.entries is not None and np.all(np.isfinite(mass.entries)):
         return
-    still = [name for name, row in zip(test.sensor_names, test.rigid_body, strict=True) if not np.any(row)]
+    moved, tolerance = np.any(test.rigid_body, axis=1), tolerance_of(test)
+    still = [test.sensor_names[i] for i in np.flatnonzero(~moved & (tolerance[: moved.size] == 0))]
     for name in still:
         yield Finding(
             "assumed gain", Severity.NOTE,
@@ -188,7 +255,7 @@ def assumed(problem: Prepared) -> Iterator[Finding]:
             "1 % in it makes 2 % in the diagonal of M_SS, K_SS and C there",
             channel=name,
         )  # fmt: skip
-    if test.force is not None and mass.totals is None:
+    if test.force is not None and mass.totals is None and not np.any(tolerance[-test.n_base :]):
         yield Finding(
             "assumed force gain", Severity.NOTE,
             "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: an "
@@ -238,7 +305,7 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
     and its interval on either side. Where an error within that would move M_SS by more than noise does, which holds for
     right gains, that the gain is right is an assumption that matters.
     """
-    for i in np.flatnonzero(np.any(test.rigid_body, axis=1)):
+    for i in np.flatnonzero(np.any(test.rigid_body, axis=1) & (errors.tolerance == 0)):
         size, open_ = 100 * abs(errors.error[i]), 100 * LIKELY * errors.std[i]
         reach, gain = size + open_, f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}"
         if not np.isfinite(errors.error[i]):

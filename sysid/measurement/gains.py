@@ -1,0 +1,62 @@
+"""Gains of sensors, base and force: tolerances that are stated, and records without errors that were found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid.errors import InputError, finite_array
+from sysid.structure.structure import Array
+
+if TYPE_CHECKING:
+    from sysid.measurement.measurement import Measurement
+
+_MOST = 0.3  # of a gain: a larger tolerance is none, and likely in per cent
+
+
+def tolerances(name: str, given: Any, count: int) -> Array | None:
+    """Stated tolerances of so many gains, (count,); None where none are stated."""
+    if given is None:
+        return None
+    array = finite_array(name, given)
+    if array.shape not in ((), (1,), (count,)):
+        raise InputError(f"{name} has shape {array.shape}; one number, or ({count},), is needed")
+    if np.any((array < 0) | (array > _MOST)):
+        raise InputError(f"{name} is a fraction from 0 to {_MOST:g}, such as 0.005 for half a per cent")
+    return np.broadcast_to(array, (count,)).copy()
+
+
+def tolerance_of(test: Measurement) -> Array:
+    """Tolerances of a test's gains: of its sensors, its base directions and its force, (n_sensors + 2 d,)."""
+    given = (test.gain_std, test.n_sensors), (test.base_gain_std, test.n_base), (test.force_gain_std, test.n_base)
+    return np.concatenate([np.zeros(count) if std is None else std for std, count in given])
+
+
+def seen_at_sensors(test: Measurement) -> Array:
+    """What each gain's error makes of the sensors' gains against the base, (n_sensors, n_sensors + 2 d).
+
+    A sensor that moves with several base directions counts each by the power that it gets from it.
+    """
+    n, d = test.rigid_body.shape
+    power = test.rigid_body**2 * np.sum(np.abs(test.base) ** 2, axis=(0, 2))
+    share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+    return np.hstack([np.eye(n), -share, np.zeros((n, d))])
+
+
+def without_gains(test: Measurement, errors: Array) -> Measurement:
+    """The test with each record divided by one and the relative error of its gain, order as in `tolerance_of`.
+
+    Functions for unit motion of the base stay so: they are per what the base recorded.
+    """
+    n, d = test.rigid_body.shape
+    sensors, base, force = np.split(1 + errors[:, None], [n, n + d])
+    run: Array = np.ones((test.n_runs, 1, 1))
+    if test.has_unit_runs:
+        run, base = base[:, None], np.ones((d, 1))
+    read = lambda record, gain: None if record is None else record * run / gain  # noqa: E731
+    return replace(
+        test, response=test.response * run / sensors, base=test.base / base, force=read(test.force, force),
+        response_std=read(test.response_std, sensors), force_std=read(test.force_std, force),
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+"""Gains within their stated tolerances: what records and tolerances together make likely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import refuse
+from sysid.measurement.gains import seen_at_sensors, tolerance_of, without_gains
+from sysid.measurement.measurement import Measurement
+from sysid.structure.structure import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Relative errors of the gains of sensors, base directions and force, (n_sensors + 2 d,), normally distributed.
+
+    Attributes
+    ----------
+    values : (k,)
+        The likeliest, which are taken off the records.
+    covariance : (k, k)
+        Of what is left.
+    """
+
+    values: Array
+    covariance: Array
+
+    @classmethod
+    def stated(cls, test: Measurement) -> Calibration | None:
+        """That of the tolerances alone; None where all gains are exact."""
+        std = tolerance_of(test)
+        return cls(np.zeros(std.size), np.diag(std**2)) if np.any(std) else None
+
+    def taken_off(self, test: Measurement) -> Measurement:
+        """The test without these errors."""
+        return without_gains(test, self.values) if np.any(self.values) else test
+
+    def given(self, test: Measurement, error: Array, std: Array) -> Calibration:
+        """The same beside errors of the sensors' gains against the base that records show, (n_sensors,), NaN for none.
+
+        Both are normally distributed: the likeliest errors are linear in what is shown.
+        """
+        known = np.isfinite(error) & np.isfinite(std)
+        H = seen_at_sensors(test)[known]
+        across = self.covariance @ H.T
+        gain = across @ np.linalg.pinv(H @ across + np.diag(std[known] ** 2), hermitian=True)
+        return Calibration(
+            self.values + gain @ (error[known] - H @ self.values), self.covariance - gain @ across.T,
+        )  # fmt: skip
+
+    @property
+    def moves(self) -> Array:
+        """A factor (k, k) of the covariance."""
+        lam, V = np.linalg.eigh(self.covariance)
+        return np.asarray(V * np.sqrt(np.maximum(lam, 0.0)))
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the fields by their names; `stored_calibrations` takes them back."""
+        return {"values": self.values, "covariance": self.covariance}
+
+
+def stored_calibrations(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Calibration | None]:
+    """Gains of the tests of a stored problem, those of their tolerances where none were found."""
+    found: list[Calibration | None] = []
+    for one, test in zip(tree.get("calibrations") or [None] * len(tests), tests, strict=False):
+        stated = Calibration.stated(test)
+        if one is not None:
+            k = test.n_sensors + 2 * test.n_base
+            sound = [np.shape(one["values"]), np.shape(one["covariance"])] == [(k,), (k, k)]
+            sound = sound and all(np.all(np.isfinite(part)) for part in one.values())
+            refuse((not sound or stated is None, "the stored gains are of another test, or hold what is no number"))
+            stated = Calibration(**one)
+        found.append(stated)
+    return found
