@@ -217,6 +217,7 @@ BENCHMARKS = (
     Benchmark(
         "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "4 min", "20 s"
     ),
+    Benchmark("channels.gains", "gains within tolerances, and wrong ones, beside modes above the band", "20 min", "20 s"),
     Benchmark("channels.delays", "late channels: found first, how exactly; none on one clock", "10 min", "25 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )

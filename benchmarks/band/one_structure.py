@@ -76,7 +76,7 @@ def compared(truth: Continuous, test: Draw, least: Bound) -> Figures:
     mine = inside[[j for _, j in pairs]] if all_there else inside[:0]
     return Figures(
         result.determined, first, len(inside), len(pairs), accusations(result),
-        _ratios(found, least, mine) if all_there else {}, _held(result, least, mine) if all_there else {},
+        _ratios(found, least, mine) if all_there else {}, intervals_held(result, least, mine) if all_there else {},
         _drive(found, truth, test), seconds,
     )  # fmt: skip
 
@@ -100,7 +100,7 @@ def _ratios(found: sysid.Structure, least: Bound, mine: np.ndarray) -> dict[str,
     }
 
 
-def _held(result: sysid.Identification, least: Bound, mine: np.ndarray) -> dict[str, list[bool]]:
+def intervals_held(result: sysid.Identification, least: Bound, mine: np.ndarray) -> dict[str, list[bool]]:
     """Flags of the intervals of what belongs to modes, those that are told."""
     held = {}
     for name in ("natural_frequencies", "damping_ratios", "effective_masses", "mode_shapes"):

@@ -90,7 +90,7 @@ class TestGainNotShown:
     @pytest.fixture
     def told(self, spectra):
         def told(error, std, worth):
-            errors = GainErrors(np.array(error), np.array(std), np.zeros(3), 1000)
+            errors = GainErrors(np.array(error), np.array(std), np.zeros(3), 1000, np.zeros(3))
             return list(rests_on(spectra, errors, np.array(worth)))
 
         return told

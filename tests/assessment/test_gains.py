@@ -150,8 +150,8 @@ class TestEstimate:
         found = gain_errors(
             ModalEstimate.of_lines(dataclasses.replace(test, response=test.response / (1 + ERROR))), truth
         )
-        assert found.of_base == pytest.approx(-ERROR, abs=4e-3)
-        assert gain_errors(ModalEstimate.of_lines(misread(test, 0)), truth).of_base is None
+        assert found.of_base() == pytest.approx(-ERROR, abs=4e-3)
+        assert gain_errors(ModalEstimate.of_lines(misread(test, 0)), truth).of_base() is None
 
 
 @pytest.mark.parametrize("mass", [FullMass(), LumpedMass()], ids=["full", "lumped"])
