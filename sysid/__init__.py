@@ -15,7 +15,8 @@ from sysid.files.reading import read
 from sysid.identify import identify
 from sysid.measurement.excited_band import excited_band
 from sysid.measurement.in_time import TimeScores, time_scores
-from sysid.measurement.measurement import Measurement, Sensor, simulate
+from sysid.measurement.measurement import Measurement, Sensor
+from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
 from sysid.measurement.whole import NoiseLevels
 from sysid.models.mass import FullMass, KnownMass, LumpedMass

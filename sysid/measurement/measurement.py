@@ -14,10 +14,7 @@ from sysid.errors import (
     as_float,
     check_frequencies,
     choice,
-    flag,
-    instance,
     numbers,
-    random_generator,
     refuse,
     sequence,
     whole_number,
@@ -33,6 +30,7 @@ from sysid.structure.sensor import (
     motion_of_sensors,
     sensors_from_tree,
     sensors_to_tree,
+    without_delay,
 )
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -135,6 +133,11 @@ class Measurement:
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
+        late = stated_delays(self.sensors, self.n_sensors)
+        if np.any(late):
+            put("sensors", without_delay(self.sensors))
+            put("response", self.response * np.exp(2j * np.pi * late[:, None] * self.freq))
+            put("whole", self.whole and self.whole.earlier(np.append(late, [0.0] * (self.force is not None))))
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -351,6 +354,8 @@ class Measurement:
         band: tuple[float, float] | None = None,
         sensors: Sequence[Sensor] | None = None,
         base_axes: str | Sequence[str] | None = None,
+        base_delay: float = 0.0,
+        force_delay: float = 0.0,
     ) -> Measurement:
         """From time records on one clock (`sysid.resample` brings unequal clocks together).
 
@@ -379,6 +384,8 @@ class Measurement:
         band : (low, high), optional
             Hz, both ends included; by default all lines but zero, of "records" up to 0.4 of the sample rate, as motion
             that sampling folds back is largest above.
+        base_delay, force_delay : float
+            s, by which these records are late; sensors state theirs. Records are shifted by them, cut at their ends.
 
         Examples
         --------
@@ -393,7 +400,12 @@ class Measurement:
         check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
         G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
-        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
+        described = checked_sensors(sensors)
+        others = as_float("base_delay", base_delay), as_float("force_delay", force_delay)
+        records = spectra.runs_on_one_clock(
+            records, np.append(stated_delays(described, len(G)), others), float(sample_rate)
+        )
+        given: Any = {"rigid_body": G, "sensors": without_delay(described), "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             if estimator == "records":
@@ -413,6 +425,12 @@ class Measurement:
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
     noise_from_rest = staticmethod(levels_at_rest)
+
+
+def stated_delays(sensors: Sequence[Sensor] | None, count: int) -> Array:
+    """Delays that sensors state, s, (count,); zero where not so many are described."""
+    found = np.array([sensor.delay for sensor in sensors or ()])
+    return found if found.size == count else np.zeros(count)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
@@ -442,57 +460,3 @@ def _std(name: str, value: Any, record: ComplexArray | None, read: Callable[...,
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
     return full
-
-
-def simulate(
-    structure: Structure,
-    freq: ArrayLike,
-    *,
-    noise: float = 0.0,
-    force: bool = False,
-    rng: int | np.random.Generator | None = None,
-    base_axes: str | Sequence[str] | None = None,
-) -> Measurement:
-    """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
-
-    Parameters
-    ----------
-    structure : Structure
-    freq : array_like, shape (n_freq,)
-        Hz.
-    noise : float
-        Circular complex noise with ``E|e|² = noise² mean|record|²``, the mean taken over all runs,
-        channels and lines; responses and force apart.
-    force : bool
-        Record the base force too.
-    rng : int, numpy Generator or None
-    base_axes : str or sequence of str, optional
-        Names of the base directions, as in `Measurement`.
-
-    Returns
-    -------
-    Measurement
-        Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
-        ``measurement.residual(structure)``.
-    """
-    instance("structure", structure, Structure)
-    noise = as_float("noise", noise, "a finite fraction >= 0", at_least=0)
-    lines = check_frequencies(freq)
-    random = random_generator(rng)
-    response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
-    base_force = force_std = None
-    if flag("force", force):
-        base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
-    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
-    return Measurement(
-        lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
-        force=base_force, response_std=response_std, force_std=force_std, **options,
-    )  # fmt: skip
-
-
-def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
-    if noise == 0:
-        return record, None
-    std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
-    error = random.standard_normal(record.shape) + 1j * random.standard_normal(record.shape)
-    return record + error * std / np.sqrt(2), np.array(std)
