@@ -16,8 +16,8 @@ from sysid.identify import identify
 from sysid.measurement.excited_band import excited_band
 from sysid.measurement.in_time import TimeScores, time_scores
 from sysid.measurement.measurement import Measurement, Sensor
+from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
-from sysid.measurement.virtual_test import simulate
 from sysid.measurement.whole import NoiseLevels
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks, Totals

@@ -13,6 +13,7 @@ from sysid.files import units
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
+from sysid.measurement.spectra import on_one_clock
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
@@ -38,6 +39,9 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     for recording in recordings:
         rates.append(_rate(recording, said))
         records, rows = _records(recording, said)
+        late = np.array([channel.delay for channel in said.channels])
+        if np.any(late):
+            records = list(on_one_clock(np.array(records), late, rates[-1], f" of {recording.path}"))
         table += rows
         plain = [column for column in _time_columns(recording, said) if not column.unit]
         remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
@@ -48,8 +52,14 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
             f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
         )
-    remarks += work_of_force(*_spectra(runs, rates[0]))
+    remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0]))]
     return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks))
+
+
+def delays_in_words(said: Description) -> list[str]:
+    """A remark on each channel whose delay is stated, and taken off."""
+    late = [channel for channel in said.channels if channel.delay]
+    return [f"{one.column} is {1e3 * one.delay:.6g} ms late as stated; that is taken off" for one in late]
 
 
 def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:

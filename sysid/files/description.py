@@ -12,7 +12,7 @@ from sysid.errors import InputError, as_float, choice, flag, path_of, printable,
 from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
-_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "reference")
+_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "delay", "reference")
 _TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
@@ -34,7 +34,10 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """Description of one column, which is divided by `gain`; `axis`, `position` are None where the file tells them."""
+    """Description of one column, which is divided by `gain` and earlier by `delay`, s.
+
+    `axis`, `position` are None where the file tells them.
+    """
 
     column: str | int
     role: str
@@ -44,6 +47,7 @@ class Channel:
     unit: str
     reference: str
     gain: float
+    delay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,12 @@ def from_words(words: Sequence[str]) -> dict[str, Any]:
         known = " ".join(f"{one}=" for one in _FIELDS[1:])
         wrong = not equals or name not in _FIELDS[1:]
         refuse((wrong, f"--sensor {words[0]}: {word!r} is none of {known}; such as role=response position=0,0,3"))
-        alone, listed = name == "gain", name == "position" or (name == "axis" and "," in value)
+        alone, listed = name in ("gain", "delay"), name == "position" or (name == "axis" and "," in value)
         try:
             entry[name] = float(value) if alone else [float(one) for one in value.split(",")] if listed else value
         except ValueError:
-            such = "a number, such as gain=0.995" if alone else f"numbers, such as {name}=0,0,3"
+            examples = {"gain": "a number, such as gain=0.995", "delay": "a number, such as delay=0.002"}
+            such = examples.get(name, f"numbers, such as {name}=0,0,3")
             raise InputError(f"--sensor {words[0]}: {word!r} needs {such}") from None
     return entry
 
@@ -160,7 +165,9 @@ def _channel(entry: Any, place: str) -> Channel:
     name = text(f"{place}: name", entry.get("name", str(column)))
     unit, reference = (printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference"))
     gain = as_float(f"{place}: gain", entry.get("gain", 1.0), "a positive number, such as 0.995,", above=0)
-    return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), unit, reference, gain)
+    delay = as_float(f"{place}: delay", entry.get("delay", 0.0), "a number of seconds, such as 0.002,")
+    at = None if where is None else (x, y, z)
+    return Channel(column, entry["role"], axis, name, at, unit, reference, gain, delay)
 
 
 def description_file(path: Path) -> Path | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
-from sysid.files.assembly import base_directions, described, row_of, run_of, sensors_of, work_of_force
+from sysid.files.assembly import base_directions, delays_in_words, described, row_of, run_of, sensors_of, work_of_force
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column
@@ -60,7 +60,7 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
     kept = freq > 0
     freq, runs = freq[kept], [_at(run, kept) for run in runs]
     remarks += ["the line at 0 Hz is left out"] * (not np.all(kept))
-    remarks += [*work_of_force(runs, freq), how]
+    remarks += [*delays_in_words(said), *work_of_force(runs, freq), how]
     return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks))
 
 
@@ -108,6 +108,7 @@ def _run(
         check_column(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor
         values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
+        values = values * np.exp(2j * np.pi * freq * channel.delay)
         parts.append((channel, values))
         rms = float(np.sqrt(np.mean(np.abs(values) ** 2)))
         rows.append(row_of(column, channel, form.unit, form.factor, rms, recording))

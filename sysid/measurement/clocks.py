@@ -17,8 +17,5 @@ def without_delays(test: Measurement, delays: Array) -> Measurement:
     its `WholeRecords` says so, and their model has the samples there for unknowns.
     """
     turn = np.exp(2j * np.pi * delays[:, None] * test.freq)
-    force, whole = (None if test.force is None else test.force * turn[-1]), test.whole
-    if whole is not None:
-        taken = delays if whole.taken is None else whole.taken + delays
-        whole = replace(whole, taken=taken if np.any(taken) else None)
+    force, whole = (None if test.force is None else test.force * turn[-1]), test.whole and test.whole.earlier(delays)
     return replace(test, response=test.response * turn[: test.n_sensors], force=force, whole=whole)

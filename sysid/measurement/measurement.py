@@ -31,6 +31,7 @@ from sysid.structure.sensor import (
     motion_of_sensors,
     sensors_from_tree,
     sensors_to_tree,
+    without_delay,
 )
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -73,7 +74,7 @@ class Measurement:
         Hz; of the plain spectra of whole records, in m/s² s, that `from_time` gives with the estimator "spectra".
     gain_std, base_gain_std, force_gain_std : array_like, optional
         Tolerances: standard deviations of the relative error of each gain, of the sensors (n_sensors,), of the base's
-        (d,) and of the force's (d,); one number is that of all. Exact where none is stated.
+        (d,) and of the force's (d,); one number is that of all. By default those that `sensors` state, others exact.
 
     Notes
     -----
@@ -139,8 +140,15 @@ class Measurement:
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
+        if self.gain_std is None and any(sensor.gain_std for sensor in self.sensors or ()):
+            put("gain_std", np.array([sensor.gain_std for sensor in self.sensors or ()]))
         for name, count in (("gain_std", sensors), ("base_gain_std", d), ("force_gain_std", d)):
             put(name, tolerances(name, getattr(self, name), count))
+        late = stated_delays(self.sensors, self.n_sensors)
+        if np.any(late):
+            put("sensors", without_delay(self.sensors))
+            put("response", self.response * np.exp(2j * np.pi * late[:, None] * self.freq))
+            put("whole", self.whole and self.whole.earlier(np.append(late, [0.0] * (self.force is not None))))
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -359,6 +367,8 @@ class Measurement:
         band: tuple[float, float] | None = None,
         sensors: Sequence[Sensor] | None = None,
         base_axes: str | Sequence[str] | None = None,
+        base_delay: float = 0.0,
+        force_delay: float = 0.0,
     ) -> Measurement:
         """From time records on one clock (`sysid.resample` brings unequal clocks together).
 
@@ -387,6 +397,8 @@ class Measurement:
         band : (low, high), optional
             Hz, both ends included; by default all lines but zero, of "records" up to 0.4 of the sample rate, as motion
             that sampling folds back is largest above.
+        base_delay, force_delay : float
+            s, by which these records are late; sensors state theirs. Records are shifted by them, cut at their ends.
 
         Examples
         --------
@@ -401,7 +413,12 @@ class Measurement:
         check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
         G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
-        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
+        described = checked_sensors(sensors)
+        others = as_float("base_delay", base_delay), as_float("force_delay", force_delay)
+        records = spectra.runs_on_one_clock(
+            records, np.append(stated_delays(described, len(G)), others), float(sample_rate)
+        )
+        given: Any = {"rigid_body": G, "sensors": without_delay(described), "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             if estimator == "records":
@@ -421,6 +438,12 @@ class Measurement:
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
     noise_from_rest = staticmethod(levels_at_rest)
+
+
+def stated_delays(sensors: Sequence[Sensor] | None, count: int) -> Array:
+    """Delays that sensors state, s, (count,); zero where not so many are described."""
+    found = np.array([sensor.delay for sensor in sensors or ()])
+    return found if found.size == count else np.zeros(count)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:

@@ -127,6 +127,11 @@ class WholeRecords:
         noise = self.noise and replace(self.noise, response=self.noise.response[..., kept])
         return replace(self, noise=noise, taken=taken)
 
+    def earlier(self, delays: Array) -> WholeRecords:
+        """That of records whose delays, s, (n_sensors [+ 1],), were taken off their spectra."""
+        taken = delays if self.taken is None else self.taken + delays
+        return replace(self, taken=taken if np.any(taken) else None)
+
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
 

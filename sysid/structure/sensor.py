@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, instance, refuse, sequence, shown, text
+from sysid.errors import InputError, as_float, finite_array, instance, refuse, sequence, shown, text
 
 Array = NDArray[np.floating[Any]]
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -85,32 +85,41 @@ class Sensor:
         m.
     axis : str or tuple of float, shape (3,)
         "x", "-y", ..., or a direction vector.
+    delay : float
+        s, by which its records are late. A `Measurement` takes it off when it is made: its sensors have none.
+    gain_std : float
+        Tolerance of its gain: standard deviation of the relative error, such as 0.005; exact by default.
 
     Raises
     ------
     InputError
-        Where the name is no text, or position or axis is not as above.
+        Where the name is no text, or another field is not as above.
     """
 
     name: str
     position: tuple[float, float, float]
     axis: str | tuple[float, float, float]
+    delay: float = 0.0
+    gain_std: float = 0.0
 
     def __post_init__(self) -> None:
         label = f"sensor {text('the name of a Sensor', self.name)!r}"
         vector3(self.position, f"the position of {label}")
         sensor_row(self.axis, label)
+        as_float(f"the delay of {label}", self.delay, "a number of seconds, such as 0.002")
+        as_float(f"gain_std of {label}", self.gain_std, "a fraction, such as 0.005", at_least=0)
 
     def to_tree(self) -> dict[str, Any]:
-        """Name, position and axis as strings and arrays, for `from_tree`."""
+        """Name, position and axis as strings and arrays, for `from_tree`; those of a test have no delay."""
         axis = self.axis if isinstance(self.axis, str) else np.array(self.axis, dtype=float)
-        return {"name": self.name, "position": np.array(self.position, dtype=float), "axis": axis}
+        own = {"gain_std": self.gain_std} if self.gain_std else {}
+        return {"name": self.name, "position": np.array(self.position, dtype=float), "axis": axis, **own}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Sensor:
         """Sensor from a dictionary that `to_tree` made."""
         axis = tree["axis"] if isinstance(tree["axis"], str) else tuple(tree["axis"].tolist())
-        return cls(tree["name"], tuple(tree["position"].tolist()), axis)
+        return cls(tree["name"], tuple(tree["position"].tolist()), axis, gain_std=tree.get("gain_std", 0.0))
 
 
 def checked_sensors(given: Sequence[Any] | None) -> tuple[Sensor, ...] | None:
@@ -119,6 +128,11 @@ def checked_sensors(given: Sequence[Any] | None) -> tuple[Sensor, ...] | None:
     for at, sensor in enumerate(sensors or ()):
         instance(f"sensors[{at}]", sensor, Sensor)
     return sensors
+
+
+def without_delay(sensors: Sequence[Sensor] | None) -> tuple[Sensor, ...] | None:
+    """The sensors as those of records on one clock; None where they are not described."""
+    return None if sensors is None else tuple(replace(sensor, delay=0.0) for sensor in sensors)
 
 
 def sensors_to_tree(sensors: Sequence[Any] | None) -> list[dict[str, Any]] | None:

@@ -260,18 +260,42 @@ def test_a_stated_gain_divides_its_channel_in_records_and_spectra(tmp_path):
     np.testing.assert_allclose(test.force, plain.force / 0.8, rtol=1e-12)
 
 
-def test_a_gain_is_stated_at_the_command_line_too(tmp_path, monkeypatch, capsys):
+def test_gain_and_delay_are_stated_at_the_command_line_too(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.csv").write_text("\n".join(table()))
     base, top = ["--sensor", "table", "role=base", "axis=x"], ["--sensor", "top", "role=response", "axis=x"]
     words = ["read", "run.csv", *base, *top]
     assert cli.main([*words, "gain=0.8"]) == 0
     np.testing.assert_allclose(recorded_test.load("test.h5").runs[0][1][0], records()[2][1] / 0.8, rtol=1e-10)
-    for wrong in ("gain=0", "gain=low"):
+    assert cli.main([*words, "delay=-0.01"]) == 0
+    np.testing.assert_allclose(recorded_test.load("test.h5").runs[0][1][0], records()[2][1][:-2], rtol=1e-10)
+    for wrong, right in (("gain=0", "0.995"), ("gain=low", "0.995"), ("delay=late", "0.002")):
         capsys.readouterr()
         assert cli.main([*words, wrong]) == 2
         told = capsys.readouterr().err
-        assert told.count("\n") == 1 and "gain" in told and "0.995" in told
+        assert told.count("\n") == 1 and wrong[:4] in told and right in told
+
+
+def test_a_stated_delay_is_taken_off_its_channel_in_records_and_spectra(tmp_path):
+    rate, delays, time = 200.0, (0.0, 0.0125, -0.00337), np.arange(600) / 200
+    motion = lambda t: np.sin(2 * np.pi * 7 * t) + np.cos(2 * np.pi * 31.3 * t)  # noqa: E731
+    late = [motion(time - delay) for delay in delays]
+    np.savez(tmp_path / "run.npz", fs=rate, table=late[0], top=late[1], force=late[2])
+    units = ("m/s²", "m/s²", "N")
+    every = zip(SENSORS["sensor"], delays, units, strict=True)
+    test = reading.gather(
+        tmp_path / "run.npz", {"sensor": [{**one, "delay": s, "unit": unit} for one, s, unit in every]}
+    )
+    rows = np.vstack(test.runs[0])
+    np.testing.assert_allclose(rows, np.tile(rows[0], (3, 1)), atol=1e-8)
+    assert rows.shape[1] == 600 - 64 - 3  # the delays in whole samples are 2 and -1
+    assert sum("late" in remark for remark in test.remarks) == 2
+    np.savez(tmp_path / "a.npz", freq=FREQ, H=H, F=F)
+    stated = [{**one, "delay": 0.002} if one["column"] in ("H[2]", "F") else one for one in MATRIX["sensor"]]
+    test, plain = (sysid.read(tmp_path / "a.npz", {**MATRIX, "sensor": one}) for one in (stated, MATRIX["sensor"]))
+    turn = np.exp(2j * np.pi * plain.freq * 0.002)
+    np.testing.assert_allclose(test.response, plain.response * np.array([turn**0, turn, turn**0]), rtol=1e-12)
+    np.testing.assert_allclose(test.force, plain.force * turn, rtol=1e-12)
 
 
 def test_a_file_without_sensors_points_to_the_help_in_one_line(tmp_path, monkeypatch, capsys):

@@ -324,9 +324,15 @@ def _late(test: Measurement, delays: Delays) -> Iterator[Finding]:
             "late sensor", Severity.NOTE,
             f"{who} is recorded {1e3 * abs(delay):.4g} ms {word} against {whom} (standard deviation {1e3 * std:.1g} "
             "ms), as by a clock or a filter of its own; that is taken off before anything else is judged",
-            "bring the records to one clock (sysid.resample), or filter all channels alike",
+            f"state it where the channel is described: delay = {_digits(delay, std, delays.of_base)}, or bring the "
+            "records to one clock (sysid.resample), or filter all channels alike",
             channel=None if delays.of_base else who, numbers={"delay": delay, "std": std},
         )  # fmt: skip
+
+
+def _digits(delay: float, std: float, of_base: bool) -> str:
+    """A delay, s, to a tenth of its deviation at least; that of the base is the others' with the other sign."""
+    return f"{(-1) ** of_base * delay:.{int(np.clip(1 - np.floor(np.log10(max(std, 1e-9))), 6, 9))}f}"
 
 
 def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding, ...]:

@@ -1,4 +1,4 @@
-"""The virtual test: spectra that a structure would give, with noise."""
+"""The virtual test of a structure: its spectra under unit base motion, with noise."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import as_float, check_frequencies, flag, instance, random_generator
 from sysid.measurement.measurement import Measurement, unit_runs
+from sysid.structure.sensor import without_delay
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 
@@ -52,7 +53,7 @@ def simulate(
     base_force = force_std = None
     if flag("force", force):
         base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
-    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
+    options: Any = {"sensors": without_delay(structure.sensors), "base_axes": base_axes}
     return Measurement(
         lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
         force=base_force, response_std=response_std, force_std=force_std, **options,
