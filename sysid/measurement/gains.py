@@ -45,6 +45,15 @@ def seen_at_sensors(test: Measurement) -> Array:
     return np.hstack([np.eye(n), -share, np.zeros((n, d))])
 
 
+def tolerances_at_sensors(test: Measurement) -> Array:
+    """What independent standard normals make of the sensors' gains against the base, (n_sensors, k).
+
+    Those of the tolerances that are not zero; the force's make nothing of them.
+    """
+    moves = seen_at_sensors(test) * tolerance_of(test)
+    return np.asarray(moves[:, np.any(moves != 0, axis=0)])
+
+
 def without_gains(test: Measurement, errors: Array) -> Measurement:
     """The test with each record divided by one and the relative error of its gain, order as in `tolerance_of`.
 

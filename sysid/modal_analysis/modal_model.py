@@ -13,7 +13,7 @@ the modes, :math:`w^2 (W^2 - w^2 + i w \Phi' C \Phi)^{-1}` stands in the place o
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -155,6 +155,8 @@ class Parameters:
     traces : (runs, c, 3)
     coupling : (m, m) or None
         rad/s, off the diagonal of ``Phi' C Phi``, of modes that dampers couple; None where damping is classical.
+    gains : (k,)
+        Errors of gains within tolerances, in these: see `tolerances_at_sensors`; empty where all are zero.
     """
 
     modes: Modes
@@ -162,6 +164,7 @@ class Parameters:
     ends: Array
     traces: Array
     coupling: Array | None = None
+    gains: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, kept: NDArray[Any]) -> Parameters:
         """Those of some of the modes, by flags (m,) or numbers."""
@@ -195,6 +198,7 @@ class SpectralModel:
         self.moving: dict[int, int] = {}
         self.n_ends = 0
         self.gains = False
+        self.by_gains: Array = np.zeros((self.n, 0))
 
     @property
     def numbers(self) -> int:
@@ -220,8 +224,9 @@ class SpectralModel:
         return (Lines(self, p, run) for run in self.parts())
 
     def chi2(self, p: Parameters, levels: Array) -> float:
-        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
-        return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
+        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees, and of gains by tolerances."""
+        of_gains = float(p.gains @ p.gains) / 2
+        return of_gains + float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
 
     def trial_chi2(self, p: Parameters, levels: Array) -> float:
         """The same of a step's end; infinite where it went beyond all measure."""
@@ -241,7 +246,10 @@ class Lines:
         modes = p.modes
         self.g = gains(freq, modes.omega, modes.ratios)
         self.shapes = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
-        self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
+        rigid = model.test.rigid_body
+        if p.gains.size:
+            rigid = rigid * (1 + model.by_gains @ p.gains)[:, None]
+        self.direct = rigid if not model.force else np.vstack([rigid, p.rigid])
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
         self.transients = np.zeros((0, run.w.size), complex) if at is None else model.transients(freq)

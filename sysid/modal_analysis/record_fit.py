@@ -141,7 +141,8 @@ class RecordFit:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
         model, kept = self.model, self.model.kept
         N, size = unit_diagonal(self.normal)
-        turned = half_inverse(N[kept:, kept:], 1e-12).T @ N[kept:, :kept]
+        beside = slice(kept, model.of_gains.start)  # what tolerances leave open counts by itself: see `Calibration`
+        turned = half_inverse(N[beside, beside], 1e-12).T @ N[beside, :kept]
         A = np.zeros((model.index.size, model.index.size))
         A[:kept, :kept] = (N[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
         return A
@@ -171,6 +172,7 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
+            "gains": p.gains,
         }  # fmt: skip
 
     @classmethod
@@ -185,13 +187,21 @@ class RecordFit:
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
         coupling, kept = tree.get("coupling"), tree.get("kept")  # results of before hold none
-        p = Parameters(Modes(**tree["modes"]), tree["rigid"], tree["ends"], tree["traces"], coupling)
+        p = Parameters(
+            Modes(**tree["modes"]),
+            tree["rigid"],
+            tree["ends"],
+            tree["traces"],
+            coupling,
+            tree.get("gains", np.zeros(0)),
+        )
         fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
-        parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels]
+        parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains]
         shapes: list[tuple[int, ...]] = [
             (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
             (test.n_runs, c, trace_count(test)), (len(model.runs), c + model.d),
+            (model.by_gains.shape[1],),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
@@ -253,13 +263,13 @@ def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | Non
 
 
 def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
-    """The fit of the same records with other delays taken off."""
+    """The fit of the same records with other delays, or errors of gains, taken off."""
     assert test.whole is not None
     test = replace(test, whole=replace(test.whole, varying=fit.model.whole.varying))
     p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
     traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
     traces[..., :TRACES] = p.traces[..., :TRACES]
-    return refitted(replace(fit, test=test), replace(p, traces=traces), monitor=monitor)
+    return refitted(replace(fit, test=test), replace(p, traces=traces, gains=np.zeros(0)), monitor=monitor)
 
 
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:

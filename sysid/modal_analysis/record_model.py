@@ -12,6 +12,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.measurement.gains import tolerances_at_sensors
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
@@ -46,7 +47,9 @@ class RecordModel(SpectralModel):
 
     The last `static` modes share a pole that is held, and do not move at the ends of runs. Where the others are
     `coupled` by dampers, entries of ``Phi' C Phi`` off the diagonal are the last unknowns before those of gains: each
-    once, or, without a force, where modes have no scale of their own, on both sides of the diagonal.
+    once, or, without a force, where modes have no scale of their own, on both sides of the diagonal. Where gains have
+    tolerances, errors in units of these stand there too, with a chi-squared of their own: ``G u`` of each sensor takes
+    its factor, so that nothing else makes up for it.
 
     Attributes
     ----------
@@ -74,6 +77,7 @@ class RecordModel(SpectralModel):
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
+        self.by_gains: Array = tolerances_at_sensors(test)
         self.pulses, reached = self.whole.pulses(test.freq[-1])
         self._place(static, trace_count(test), gains=gains, coupled=coupled)
         if self.pulses.size:  # a run that begins and ends at rest has none
@@ -89,7 +93,8 @@ class RecordModel(SpectralModel):
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
         self.coupling = slice(before, before + len(self.coupled))
-        self.n_fit = self.coupling.stop
+        self.of_gains = slice(self.coupling.stop, self.coupling.stop + self.by_gains.shape[1])
+        self.n_fit = self.of_gains.stop
         self.gains = gains
         self.delays = self.n_fit + 3 * self.n * self.d  # where they begin
         self.size = self.delays + self.n + self.force if gains else self.n_fit
@@ -136,7 +141,8 @@ class RecordModel(SpectralModel):
         theta = np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios)])
         rigid = np.array([p.rigid[i, j] for i, j in index.pairs]) if self.force else np.zeros(0)
         coupling = np.zeros(len(self.coupled)) if p.coupling is None else p.coupling[*self.coupled.T]
-        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling])
+        of_gains = p.gains if p.gains.size else np.zeros(self.by_gains.shape[1])
+        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling, of_gains])
 
     def unpack(self, x: Array) -> Parameters:
         """The inverse of `pack`."""
@@ -154,7 +160,7 @@ class RecordModel(SpectralModel):
             coupling = np.zeros((self.m, self.m))
             coupling[*self.coupled.T] = x[self.coupling]
             coupling = coupling + coupling.T if self.force else coupling
-        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape), coupling)
+        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape), coupling, x[self.of_gains])
 
     def moved(self, x: Array, step: Array, most: float = 1.0) -> Array:
         """Unknowns after a step, to first order their sum: a mode's scale, shape against load, changes by a factor.
@@ -174,9 +180,9 @@ class RecordModel(SpectralModel):
 
     @property
     def unknowns(self) -> int:
-        """Numbers that the records determine: without a force the scale of each mode is none."""
+        """Numbers that the records determine: not those within tolerances, nor, without a force, scales of modes."""
         turns = self.static * (self.static - 1) // (2 if self.force else 1)
-        return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns
+        return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns - self.by_gains.shape[1]
 
     def scales(self, p: Parameters) -> Array:
         """Moves of all unknowns that change nothing, (k, size): without a force, shape against load of each mode."""
@@ -226,6 +232,11 @@ class RecordModel(SpectralModel):
                 normal[np.ix_(at, at)] += products.normal
             gradient[at] += products.gradient
             chi2 += products.chi2
+        if p.gains.size:
+            diagonal = np.arange(self.of_gains.start, self.of_gains.stop)
+            normal[diagonal, diagonal] += 0.5
+            gradient[diagonal] -= p.gains / 2
+            chi2 += float(p.gains @ p.gains) / 2
         if np.any(self.held):
             normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
         return NormalEquations(normal, gradient, chi2)
@@ -335,6 +346,11 @@ class Chunk(Lines):
         if model.gains:
             late = last + traces.size + 2 * d + channel
             yield np.array([model.delays + min(channel, n)]), np.array([late]), np.ones(1)
+        if channel < n and model.by_gains.size:
+            of_gains = np.arange(model.of_gains.start, model.of_gains.stop)
+            for j in range(d):
+                share = model.by_gains[channel] * model.test.rigid_body[channel, j]
+                yield of_gains, np.full(of_gains.size, base + j), share
         if model.gains and channel < n:
             yield model.n_fit + channel * d + beside, base + beside, np.ones(d)
             for kind in (1, 2):
@@ -396,7 +412,7 @@ class CoupledChunk(Chunk):
             at = np.union1d(moves[0].unknowns, rows)
             J = np.zeros((at.size, root.size), complex)
             self._add(J, np.einsum("k,kjl->jl", shape, self.flexibility), moves, at)
-            J[np.searchsorted(at, rows)] += spectra
+            np.add.at(J, np.searchsorted(at, rows), spectra)
             J *= scale[channel] * root
             normal[np.ix_(at, at)] += dots(J, J)
         for part in self.covered(levels):
@@ -431,7 +447,8 @@ class CoupledChunk(Chunk):
         """Unknowns (k,) that show in a channel beside what all of them feel, and their columns there."""
         m = self.records.m
         entries = [*self.of_motion(channel, m), *self.of_sensor(channel, m, m + self.records.d)]
-        return np.concatenate([one[0] for one in entries]), alone[np.concatenate([one[1] for one in entries])]
+        rows, spectra, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+        return rows, values[:, None] * alone[spectra]
 
     def _seen(self, weights: ComplexArray, moves: list[Moves], alone: ComplexArray) -> ComplexArray:
         """Sums of all columns (size, L) over the channels, with weights (c, L)."""
@@ -440,7 +457,7 @@ class CoupledChunk(Chunk):
         self._add(out, felt, moves, np.arange(self.records.size))
         for channel, weight in enumerate(weights):
             rows, spectra = self._of_channel(channel, alone)
-            out[rows] += weight * spectra
+            np.add.at(out, rows, weight * spectra)
         return out
 
     @staticmethod

@@ -197,7 +197,9 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     """The same, whatever is left, over partitions that begin later each: where blocks begin must not matter."""
     model, p = fit.model, fit.parameters
     N, size = unit_diagonal(fit.normal)
-    half, size = half_inverse(N, 1e-12), np.where(model.held, np.inf, size)
+    held = model.held | np.isin(np.arange(model.size), np.r_[model.of_gains])  # as in `RecordFit.information`
+    N[held], N[:, held] = 0.0, 0.0
+    half, size = half_inverse(N, 1e-12), np.where(held, np.inf, size)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [model.chunk(p, run.at(slice(0, 1))).columns() for run in model.runs]
     for shift in np.arange(partitions) / partitions:
@@ -292,8 +294,9 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     Poles above the lines stand for more modes than there are of them: the part that these leave is asked for then, as
     where both agree by chance the first would pass for exact.
     """
-    equations, G = fit.equations.at(slice(fit.asked.delays)), fit.test.rigid_body
-    (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
+    asked, G = _asked_of_gains(fit), fit.test.rigid_body
+    equations, (n, d) = fit.equations.at(asked), G.shape
+    at = asked.size - 3 * n * d  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(2 * n * d))
     normal, size = unit_diagonal(along.T @ equations.normal @ along)
@@ -309,10 +312,19 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     plain_std = np.hypot(plain_std, plain - error)
     better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
     rigid, chi2 = _rigid(fit, beyond)
-    moves = _moves_by_gains(fit, half_inverse(normal[:at, :at], ROUND_OFF) / size[:at, None])
+    fitted = half_inverse(normal[:at, :at], ROUND_OFF) / size[:at, None]
+    half = np.zeros((fit.model.size, fitted.shape[1]))
+    half[asked[:at]] = fitted
+    moves, found = _moves_by_gains(fit, half), fit.model.by_gains @ fit.parameters.gains
     return Gains(
-        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
+        found + np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
     )  # fmt: skip
+
+
+def _asked_of_gains(fit: RecordFit) -> NDArray[np.intp]:
+    """Unknowns that are asked where gains are, errors within tolerances held, as what records show does not know of."""
+    left_out = np.concatenate([np.r_[fit.model.of_gains], np.flatnonzero(fit.model.held)])
+    return np.setdiff1d(np.arange(fit.asked.delays), left_out)
 
 
 def _moves_by_gains(fit: RecordFit, half: Array) -> Array:
@@ -341,7 +353,8 @@ def _moves_by_gains(fit: RecordFit, half: Array) -> Array:
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
-    equations, (n, d), at = fit.equations.at(slice(fit.asked.delays)), fit.test.rigid_body.shape, fit.model.size
+    chosen, (n, d) = _asked_of_gains(fit), fit.test.rigid_body.shape
+    equations, at = fit.equations.at(chosen), chosen.size - 3 * n * d
     normal, size = unit_diagonal(equations.normal)
     half, asked = half_inverse(normal, ROUND_OFF), slice(at, at + n * d)
     step = (half @ (half.T @ (equations.gradient / size)))[asked].reshape(n, d)
