@@ -374,6 +374,9 @@ def _add_export(command: Adder) -> None:
     )
     _add_result(export)
     export.add_argument("file", metavar="FILE", help="the file to write")
+    export.add_argument(
+        "--positive-axes", action="store_true", help="turn rows of sensors along -x, -y, -z to +x, +y, +z"
+    )
 
 
 def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
