@@ -17,8 +17,6 @@ from sysid.files.recording import Column
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import largest_modulus
 
-_MOVED = 0.01  # of the mean power of the base, from which it counts as moved at a line
-
 
 class UnitColumns(NamedTuple):
     """Records of one clock: the file's name, time of the first sample by it, s, samples a second, and its columns."""
@@ -95,6 +93,11 @@ def _spectra(a: Array, b: Array) -> tuple[ComplexArray, ComplexArray, int]:
     return np.fft.rfft(a, n), np.fft.rfft(b, n), n
 
 
+def _least(power: Array, share: float = 0.01) -> float:
+    """Power of the base from which it counts as moved at a line: a share of its mean."""
+    return share * float(power.mean())
+
+
 def _with_lag(base: Array, record: Array) -> _Pair:
     """Two records with the lag at the peak of the impulse response from one to the other.
 
@@ -104,7 +107,7 @@ def _with_lag(base: Array, record: Array) -> _Pair:
     power = np.abs(X) ** 2
     if not np.any(power) or not np.any(Y):
         return _Pair(base, record)
-    envelope = np.abs(np.fft.ifft(Y * X.conj() / (power + _MOVED * power.mean()), n))
+    envelope = np.abs(np.fft.ifft(Y * X.conj() / (power + _least(power)), n))
     at = int(np.argmax(envelope))
     chance = np.sqrt(2 / np.log(2)) * largest_modulus(n) * np.median(envelope)
     return _Pair(base, record, at if at < record.size else at - n, float(envelope[at] / chance))
@@ -116,7 +119,7 @@ def _quasi_static(pair: _Pair, blocks: int = 400) -> float:
     size = -(-X.size // blocks)
     whole = X.size // size * size
     base, record = (np.sum(np.abs(one[:whole]).reshape(-1, size) ** 2, axis=1) for one in (X, Y))
-    moved = np.flatnonzero(base > _MOVED * base.mean())
+    moved = np.flatnonzero(base > _least(base))
     gain = record[moved] / base[moved]
     beyond = moved[gain > 4 * gain[0]]
     return float(beyond[0] * size / n if beyond.size else 0.5)
@@ -130,7 +133,7 @@ def _refined(pair: _Pair, last: float, fewest: int = 10) -> tuple[int, float]:
     X, Y, n = _spectra(pair.base, pair.record)
     line, moved = np.arange(X.size), np.abs(Y) ** 2
     power = np.abs(np.fft.rfft(pair.base * np.hanning(pair.base.size), n)) ** 2  # without leakage of what was cut off
-    slow = (line < last * n) & (power > _MOVED * power.mean())
+    slow = (line < last * n) & (power > _least(power))
     low = np.quantile(line[slow], 0.1) if np.any(slow) else 0.0
     if np.count_nonzero(slow) < fewest or 2 * low > last * n:  # of less than an octave one period passes for another
         return pair.lag, float(2 * n * moved.sum() / np.sum(line * moved))
