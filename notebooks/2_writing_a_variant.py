@@ -162,6 +162,27 @@ assert result.determined
 sysid.plot.transmissibility(result, band=result.uncertainty.transmissibility(freq))
 
 # %% [markdown]
+# ## A sensor that reads too much
+#
+# What is not in the matrices can be an unknown too: here the sensor on floor 3 reads 3 % too much, and its gain is not
+# known. The residual is then written out, record less prediction, as complex numbers, and `sysid.real_and_imaginary`
+# makes one term of it that counts by the noise of the records. A delay would be a factor `np.exp(-1j * w * tau)`.
+
+# %%
+record = test.response[0] * [[1.0], [1.0], [1.03], [1.0]]
+gain = sysid.Variable("gain of floor 3", lower=0.8, upper=1.25)
+predicted = sysid.FurtherTest(test, mass=M, stiffness=K, damping=C).response
+read = (1 + (gain - 1) * np.array([[0.0], [0.0], [1.0], [0.0]])) * predicted
+own = sysid.Problem(
+    test, mass=M, stiffness=K, damping=C, constraints=[ca.sum1(m) == 332.0],
+    misfit=sysid.real_and_imaginary(read - record),
+)  # fmt: skip
+result = sysid.identify(own, strategy=once, rng=0)
+found, std = result.values["gain of floor 3"], result.uncertainty.variables["gain of floor 3"]
+print(f"gain of floor 3: {found:.4f} ± {1.96 * std:.4f}")
+assert abs(found - 1.03) < 4 * std
+
+# %% [markdown]
 # ## The same as a module
 #
 # In a notebook you try; in a module you keep. `sysid new my_structure` writes a commented module and its test, which
@@ -184,6 +205,7 @@ sysid.plot.transmissibility(result, band=result.uncertainty.transmissibility(fre
 # | sensors on some floors only | `recovery=np.eye(4)[[0, 3]]`, in `Problem`, `FurtherTest` and `Structure` alike |
 # | the force at the base | `force=` of the measurement: it weighs the structure |
 # | magnitudes without phase | `misfit=`: any column of residuals in the place of the usual one |
+# | gain, delay, loss factor | `misfit=sysid.real_and_imaginary(prediction - record)`, of complex expressions |
 # | something known to some accuracy | `residuals=[sysid.Prior(m[3], 12.0, std=0.2)]` |
 # | an order, a limit, a total | `constraints=[k[0] >= k[1], ca.sum1(m) <= 340]` |
 # | a finite-element frame | `sysid.frame`, its sections' properties as variables |

@@ -24,7 +24,7 @@ from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks,
 from sysid.models.stiffness_and_damping import ChainStiffness, ModalDamping, ProportionalDamping, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
-from sysid.problem.terms import FurtherTest, Prior
+from sysid.problem.terms import FurtherTest, Prior, real_and_imaginary
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.continuation import Continuation
@@ -71,5 +71,6 @@ __all__ = [
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",
     "SpectralStiffness", "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores",
     "Totals", "Unknown", "Variable", "__version__", "catalogue", "excited_band", "export", "identify", "jobs", "load",
-    "minimize_swarm", "plot", "read", "resample", "rigid_body", "simulate", "time_scores", "write_report",
+    "minimize_swarm", "plot", "read", "real_and_imaginary", "resample", "rigid_body", "simulate", "time_scores",
+    "write_report",
 ]  # fmt: skip

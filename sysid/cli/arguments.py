@@ -267,6 +267,12 @@ def _add_read(command: Adder) -> None:
         default=None,
         help="a file a sensor: the files of a folder are one run; columns are called FILE, or FILE.COLUMN of several",
     )
+    read.add_argument(
+        "--align",
+        action="store_true",
+        default=None,
+        help="files of a run that have clocks of their own are brought to that of the base by the motion they share",
+    )
     read.add_argument("--base-axes", metavar="AXES", help='along which the base moves, such as "x" or "x rz"')
     read.add_argument("--frf", metavar="FORM", help="of frequency responses: transmissibility, accelerance, mobility, "
                       "receptance, apparent mass")  # fmt: skip
@@ -368,6 +374,9 @@ def _add_export(command: Adder) -> None:
     )
     _add_result(export)
     export.add_argument("file", metavar="FILE", help="the file to write")
+    export.add_argument(
+        "--positive-axes", action="store_true", help="turn rows of sensors along -x, -y, -z to +x, +y, +z"
+    )
 
 
 def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) -> None:

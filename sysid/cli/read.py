@@ -45,6 +45,7 @@ def _said(options: argparse.Namespace) -> Any:
     """The description by the options; over a TOML file where both say something."""
     given: dict[str, Any] = {
         "sample_rate": options.rate, "time": options.time, "frequency": options.frequency, "join": options.join,
+        "align": options.align,
         "base_axes": options.base_axes, "frf": options.frf, "convention": options.convention,
     }  # fmt: skip
     given = {name: value for name, value in given.items() if value is not None}

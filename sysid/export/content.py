@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 
-from sysid.errors import shown_plainly
+from sysid.errors import refuse, shown_plainly
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
+from sysid.structure.sensor import BASE_AXES, Sensor, sensor_row
 from sysid.structure.structure import Array, Structure
 from sysid.structure.superelement import CraigBampton
 
@@ -25,32 +28,108 @@ def matrices_of(structure: Structure) -> dict[str, Array]:
     return {"M": structure.mass, "K": structure.stiffness, "C": relative.T @ structure.damping @ relative}
 
 
-def deviations_of(it: Identification) -> dict[str, Array]:
-    """Standard deviations of `matrices_of`; NaN where they are not known, as in all rows and columns of the base."""
-    n, size = it.structure.n, len(it.structure.mass)
-    found = {}
-    for letter, name in (("M", "mass"), ("K", "stiffness"), ("C", "damping")):
-        found[letter] = np.full((size, size), np.nan)
-        found[letter][:n, :n] = it.quick_std(name)[:n, :n]
-    return found
+@dataclass(frozen=True, eq=False)
+class Content:
+    """A result as it is written: its structure and sensors as recorded, or turned to positive axes.
+
+    Attributes
+    ----------
+    it : Identification
+    structure : Structure
+        Whose rows are along `sensors`.
+    sensors : tuple of Sensor or None
+        None where they are not described.
+    """
+
+    it: Identification
+    structure: Structure
+    sensors: tuple[Sensor, ...] | None
+
+    @classmethod
+    def of(cls, it: Identification, positive_axes: bool = False) -> Content:
+        """The content of a result, all its sensors along +x, +y, +z, +rx, ... where `positive_axes`."""
+        sensors = it.measurement.sensors
+        if not positive_axes:
+            return cls(it, it.structure, sensors)
+        undescribed = "the axes of the sensors are not known: describe them (sensors=[sysid.Sensor(...)])"
+        refuse((sensors is None, f"positive axes: {undescribed}"))
+        sensors = sensors or ()
+        signs = np.array([-1.0 if _negative(sensor) else 1.0 for sensor in sensors])
+        described = zip(sensors, signs, strict=True)
+        turned = tuple(replace(one, axis=_positive(one)) if sign < 0 else one for one, sign in described)
+        return cls(it, _turned(it.structure, signs, turned), turned)
+
+    @property
+    def base_axes(self) -> tuple[str, ...]:
+        """Directions of the base."""
+        return self.it.measurement.base_axes or ()
+
+    @cached_property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensors with their axes, such as "floor 2 (-x)"; without them where they are not described."""
+        axes = [f" ({_axis_in_words(sensor)})" for sensor in self.sensors or ()]
+        names = self.it.measurement.sensor_names
+        return tuple(name + axis for name, axis in zip(names, axes or [""] * len(names), strict=True))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the rows of the matrices: the structure's degrees of freedom, then "base x" and so on."""
+        called = list(self.it.degrees_of_freedom)
+        for row, sensor in enumerate(self.structure.dof_sensors):
+            called[row] = self.sensor_names[sensor] if sensor >= 0 else called[row]
+        return (*called, *(f"base {axis}" for axis in self.base_axes))
+
+    @cached_property
+    def rotations(self) -> tuple[bool | None, ...]:
+        """Which rows of the matrices are rotations; None for a coordinate that no sensor records."""
+        axes = [sensor.axis for sensor in self.sensors or ()] or [""] * self.structure.n_sensors
+        turns = [isinstance(axis, str) and "r" in axis for axis in axes]
+        turned = (turns[j] if j >= 0 else None for j in self.structure.dof_sensors)
+        return (*turned, *(axis.startswith("r") for axis in self.base_axes))
+
+    @property
+    def deviations(self) -> dict[str, Array]:
+        """Standard deviations of `matrices_of`; NaN where not known, as in all rows and columns of the base."""
+        n, size = self.structure.n, len(self.structure.mass)
+        found = {}
+        for letter, name in (("M", "mass"), ("K", "stiffness"), ("C", "damping")):
+            found[letter] = np.full((size, size), np.nan)
+            found[letter][:n, :n] = self.it.quick_std(name)[:n, :n]
+        return found
 
 
-def names_of(it: Identification) -> tuple[str, ...]:
-    """Names of the rows of the matrices: the structure's degrees of freedom, then "base x" and so on."""
-    return (*it.degrees_of_freedom, *(f"base {axis}" for axis in it.measurement.base_axes or ()))
+def _negative(sensor: Sensor) -> bool:
+    """True where a sensor points along -x, -ry or the like, by its word or its vector."""
+    row = sensor_row(sensor.axis, sensor.name)
+    return bool(np.count_nonzero(row) == 1 and row.sum() < 0)
+
+
+def _positive(sensor: Sensor) -> str:
+    return BASE_AXES[int(np.flatnonzero(sensor_row(sensor.axis, sensor.name))[0])]
+
+
+def _axis_in_words(sensor: Sensor) -> str:
+    axis = sensor.axis
+    return axis.lstrip("+") if isinstance(axis, str) else " ".join(f"{part:.3g}" for part in axis)
+
+
+def _turned(structure: Structure, signs: Array, sensors: tuple[Sensor, ...]) -> Structure:
+    """The structure with sensors of these signs turned, and with them the degrees of freedom that they record."""
+    recorded, beyond = structure.dof_sensors, structure.residual
+    of_dofs = np.where(recorded >= 0, signs[recorded], 1.0)
+    both, by_ratios = np.concatenate([of_dofs, np.ones(structure.n_base)]), structure.modal_damping
+    return Structure(
+        structure.mass * np.outer(both, both), structure.stiffness * np.outer(both, both),
+        structure.damping_ratios if by_ratios else None, n_base=structure.n_base,
+        damping_matrix=None if by_ratios else structure.damping * np.outer(of_dofs, of_dofs),
+        rigid_body=structure.rigid_body * signs[:, None], recovery=structure.recovery * np.outer(signs, of_dofs),
+        sensors=sensors, residual=replace(beyond, shapes=beyond.shapes * signs[:, None]),
+    )  # fmt: skip
 
 
 def entry_unit(letter: str, row: bool | None, column: bool | None) -> str:
     """Unit of an entry of M, K or C by whether row and column are rotations; "" where one is not known."""
     return "" if row is None or column is None else _UNITS[letter][row + column]
-
-
-def rotations_of(it: Identification) -> tuple[bool | None, ...]:
-    """Which rows of the matrices are rotations; None for a coordinate that no sensor records, which may be anything."""
-    axes = [sensor.axis for sensor in it.measurement.sensors or ()] or [""] * it.structure.n_sensors
-    turns = [isinstance(axis, str) and "r" in axis for axis in axes]
-    turned = (turns[j] if j >= 0 else None for j in it.structure.dof_sensors)
-    return (*turned, *(axis.startswith("r") for axis in it.measurement.base_axes or ()))
 
 
 _WORTH = {
@@ -70,9 +149,9 @@ def reliability(it: Identification) -> str:
     return _INTERRUPTED * it.interrupted + _WORTH[it.judgement] + (f"; see {why}" if why else "")
 
 
-def statements(it: Identification, precision: str) -> tuple[str, ...]:
+def statements(content: Content, precision: str) -> tuple[str, ...]:
     """Sentences of every file: origin, judgement, what is against it and open, units, order of rows, precision."""
-    structure, base = it.structure, " ".join(it.measurement.base_axes or ())
+    it, structure, base = content.it, content.structure, " ".join(content.base_axes)
     found = [
         f"written by sysid {__version__} on {datetime.now().astimezone().isoformat(timespec='seconds')}",
         f"problem: {it.recipe.title if it.recipe else 'of a script'}; strategy {it.strategy}; seed {it.seed}",
@@ -85,7 +164,8 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",
         f"rows and columns: {structure.n} of the structure, then {structure.n_base} of the base ({base}); motions are "
         "absolute, and moments refer to the point at which the base motion is given",
-        "order: " + ", ".join(f"{at} {name}" for at, name in enumerate(names_of(it), 1)),
+        "order: " + ", ".join(f"{at} {name}" for at, name in enumerate(content.names, 1)),
+        _directions(content),
         "damping acts on the motion relative to the base",
         f"precision: {precision}",
     ]
@@ -98,6 +178,16 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
     if it.facts.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
     return tuple(shown_plainly(" ".join(text.split())) for text in found)
+
+
+def _directions(content: Content) -> str:
+    """Along what a row is positive, and which were turned."""
+    if content.sensors is None:
+        return "directions: sensors are not described; a row is positive as its sensor recorded"
+    recorded = zip(content.it.measurement.sensors or (), content.sensors, strict=True)
+    turned = [f"{one.name} ({_axis_in_words(one)})" for one, other in recorded if one.axis != other.axis]
+    words = "directions: a row is positive along the axis in brackets behind its name"
+    return words + (f"; turned to it from what was recorded: {', '.join(turned)}" if turned else "")
 
 
 def one_line_each(texts: Sequence[str], width: int, mark: str = "") -> list[str]:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sysid.errors import InputError, instance, needed, path_of
-from sysid.export.content import statements
+from sysid.errors import InputError, flag, instance, needed, path_of
+from sysid.export.content import Content, statements
 from sysid.export.other_programs import write_dmig, write_op4, write_uff55
 from sysid.export.tables import write_matlab, write_text
 from sysid.results.identification import Identification
@@ -18,7 +18,7 @@ from sysid.results.storage import atomically
 class Format:
     """A format, its writer, and what its files can hold."""
 
-    write: Callable[[Identification, tuple[str, ...], Path], None]  # of the sentences of the file too
+    write: Callable[[Content, tuple[str, ...], Path], None]  # of the sentences of the file too
     name: str
     note: str  # where its files say what they are worth
     precision: str
@@ -46,7 +46,7 @@ FORMATS = {
 }
 
 
-def export(identification: Identification, path: str | Path) -> Path:
+def export(identification: Identification, path: str | Path, *, positive_axes: bool = False) -> Path:
     """Write an identified structure for another program; the ending of the file tells the format.
 
     Parameters
@@ -61,6 +61,9 @@ def export(identification: Identification, path: str | Path) -> Path:
         - ``.op4``: M, K, C, Craig-Bampton superelement (extra ``nastran``); exact
         - ``.bdf`` or ``.dmig``: the superelement as Nastran's DMIG; 10 digits
         - ``.unv`` or ``.uff``: mode shapes, universal file dataset 55; 6 digits
+    positive_axes : bool
+        Whether rows of sensors along -x, -y or -z are turned to +x, +y, +z. By default they stay as recorded; names of
+        rows tell the axis: "floor 2 (-x)". Mode shapes in universal files are along x, y, z in any case.
 
     Returns
     -------
@@ -83,8 +86,9 @@ def export(identification: Identification, path: str | Path) -> Path:
     chosen = format_of(target)
     if chosen.needs:
         needed(chosen.needs, chosen.extra, f"{target}: a {chosen.name}")
+    content = Content.of(identification, flag("positive_axes", positive_axes))
     with atomically(target) as temporary:
-        chosen.write(identification, statements(identification, chosen.precision), temporary)
+        chosen.write(content, statements(content, chosen.precision), temporary)
     return target
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import matrices_of, one_line_each, reliability, superelement_of
-from sysid.results.identification import Identification
+from sysid.export.content import Content, matrices_of, one_line_each, reliability, superelement_of
 from sysid.structure.sensor import BASE_AXES, Sensor, sensor_row
 from sysid.structure.structure import Array
 
@@ -18,7 +17,7 @@ _SYMMETRIC, _RECTANGULAR = 6, 2
 Point = tuple[int, int]  # its number and component
 
 
-def write_op4(it: Identification, about: tuple[str, ...], path: Path) -> None:
+def write_op4(content: Content, about: tuple[str, ...], path: Path) -> None:
     """Write M, K, C; MCB, KCB, CCB, RCB; DETERMND and NOTE with pyYeti.
 
     M, K and C have the structure's degrees of freedom first, those of the base last. MCB, KCB and CCB have those of the
@@ -28,24 +27,25 @@ def write_op4(it: Identification, about: tuple[str, ...], path: Path) -> None:
     """
     from pyyeti.nastran import op4
 
-    form, lines = superelement_of(it.structure), one_line_each(about, 72)
+    form = superelement_of(content.structure)
+    lines = one_line_each((*about, f"rows of RCB: {', '.join(content.sensor_names)}"), 72)
     matrices = {
-        **matrices_of(it.structure),
+        **matrices_of(content.structure),
         "MCB": form.mass, "KCB": form.stiffness, "CCB": form.damping, "RCB": form.recovery,
-        "DETERMND": np.array([[float(it.determined)]]),
+        "DETERMND": np.array([[float(content.it.determined)]]),
         "NOTE": np.array([[float(ord(letter)) for letter in line.ljust(72)] for line in lines]),
     }  # fmt: skip
     op4.write(str(path), list(matrices), list(matrices.values()), sparse="dense")
 
 
-def write_dmig(it: Identification, about: tuple[str, ...], path: Path) -> None:
+def write_dmig(content: Content, about: tuple[str, ...], path: Path) -> None:
     """Write points and the matrices MCB, KCB, BCB (mass, stiffness, viscous damping) and RCB (motion of the sensors).
 
     The base is grid point 1, components as its axes; modal coordinates are scalar points from 1001 on. RCB has the
     sensors as its rows, scalar points from 100001 on. In the case control: ``M2GG = MCB``, ``K2GG = KCB``,
     ``B2GG = BCB``. Numbers below 1e-90 are left out as zeros.
     """
-    structure, axes = it.structure, it.measurement.base_axes or ()
+    structure, axes = content.structure, content.base_axes
     form = superelement_of(structure)
     base = [(BASE, BASE_AXES.index(axis) + 1) for axis in axes]
     count = len(form.mass) - structure.n_base
@@ -53,7 +53,7 @@ def write_dmig(it: Identification, about: tuple[str, ...], path: Path) -> None:
     sensors = [(FIRST_SENSOR + k, 0) for k in range(structure.n_sensors)]
     fixed = "".join(str(c + 1) for c, axis in enumerate(BASE_AXES) if axis not in axes)
     lines = [
-        *one_line_each((*about, *_usage(it)), 72, "$ "),
+        *one_line_each((*about, *_usage(content)), 72, "$ "),
         f"GRID,{BASE},,0.,0.,0.,,{fixed}".rstrip(","),
         f"SPOINT,{FIRST_MODE},THRU,{FIRST_MODE + count - 1}" if count > 1 else f"SPOINT,{FIRST_MODE}",
         *_matrix("MCB", form.mass, rows, rows, _SYMMETRIC),
@@ -64,8 +64,8 @@ def write_dmig(it: Identification, about: tuple[str, ...], path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _usage(it: Identification) -> list[str]:
-    names = (f"{FIRST_SENSOR + k} {name}" for k, name in enumerate(it.measurement.sensor_names))
+def _usage(content: Content) -> list[str]:
+    names = (f"{FIRST_SENSOR + k} {name}" for k, name in enumerate(content.sensor_names))
     return [
         "the matrices below are not those of the order above but the Craig-Bampton form: "
         f"grid point {BASE} is the base (give it the coordinates of the point that base motion and moments refer to), "
@@ -94,13 +94,13 @@ def _matrix(name: str, matrix: Array, rows: Sequence[Point], columns: Sequence[P
 _NORMAL_MODE, _STRUCTURAL, _DISPLACEMENT, _REAL = 2, 1, 8, 2
 
 
-def write_uff55(it: Identification, about: tuple[str, ...], path: Path) -> None:
+def write_uff55(content: Content, about: tuple[str, ...], path: Path) -> None:
     """Write nodes (dataset 15) and each mode on the fixed base (55): frequency, damping ratio, shape of modal mass 1.
 
     Sensors at one place are one node; its motion is the least one that its sensors' signals have in common. Where
     sensors are not described, each is a node at the origin with its motion in x, and the file says so.
     """
-    structure, sensors = it.structure, it.measurement.sensors
+    structure, sensors = content.structure, content.sensors
     places, shapes = _nodes(sensors, structure.mode_shapes) if sensors else _in_x(structure.mode_shapes)
     where = "" if sensors else "sensors are not described: node k is sensor k, its motion stands in x"
     one, kelvin = (f"{value:25.17E}".replace("E", "D") for value in (1.0, 273.15))
@@ -110,7 +110,7 @@ def write_uff55(it: Identification, about: tuple[str, ...], path: Path) -> None:
         *_set(15, (f"{k:10d}{0:10d}{0:10d}{11:10d}" + _reals(place) for k, place in enumerate(places, 1))),
     ]
     units = where or "SI units, modal mass 1 kg, absolute motion"
-    titles = [*one_line_each([reliability(it)], 80)[:3], *one_line_each([units], 80)[:1]]
+    titles = [*one_line_each([reliability(content.it)], 80)[:3], *one_line_each([units], 80)[:1]]
     for mode in range(structure.n):
         figures = structure.natural_frequencies[mode], 1.0, structure.damping_ratios[mode], 0.0
         lines += _set(55, _mode(mode + 1, figures, shapes[:, :, mode], titles))

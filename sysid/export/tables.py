@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from sysid.export.content import deviations_of, entry_unit, matrices_of, names_of, rotations_of
-from sysid.results.identification import Identification
+from sysid.export.content import Content, entry_unit, matrices_of
 
 COLUMNS = ("matrix", "row", "column", "value", "deviation", "unit", "row_name", "column_name")
 _EMPTY = (
@@ -18,17 +17,17 @@ _EMPTY = (
 )
 
 
-def write_text(it: Identification, about: tuple[str, ...], path: Path) -> None:
+def write_text(content: Content, about: tuple[str, ...], path: Path) -> None:
     """Write one entry a row; what the file says of itself stands above in lines that begin with "#".
 
     Rows and columns are counted from 1. Numbers are written in the fewest digits that give the same number again.
     """
-    names, turned, deviations = names_of(it), rotations_of(it), deviations_of(it)
+    names, turned, deviations = content.names, content.rotations, content.deviations
     with path.open("w", newline="", encoding="utf-8") as file:
         file.writelines(f"# {text}\n" for text in (*about, *_EMPTY))
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
-        for letter, matrix in matrices_of(it.structure).items():
+        for letter, matrix in matrices_of(content.structure).items():
             for (i, j), value in np.ndenumerate(matrix):
                 std = deviations[letter][i, j]
                 known = repr(float(std)) if np.isfinite(std) else ""
@@ -36,7 +35,7 @@ def write_text(it: Identification, about: tuple[str, ...], path: Path) -> None:
                 table.writerow((letter, i + 1, j + 1, repr(float(value)), known, *described))
 
 
-def write_matlab(it: Identification, about: tuple[str, ...], path: Path) -> None:
+def write_matlab(content: Content, about: tuple[str, ...], path: Path) -> None:
     """Write M, K, C with deviations, modes, state space, names, and `about`: what the file says of itself, in lines.
 
     `G` (n_sensors, d): rigid-body motion of the sensors; `f_hz`, `zeta` (m, 1), `Phi` (n_sensors, m), `Gamma` (m, d):
@@ -44,17 +43,17 @@ def write_matlab(it: Identification, about: tuple[str, ...], path: Path) -> None
     `Cy`, `D`: from base acceleration to absolute acceleration of the sensors, residual modes included; `recovery`
     (n_sensors, n): degrees of freedom to sensors.
     """
-    s, system = it.structure, it.structure.to_state_space()
+    it, s, system = content.it, content.structure, content.structure.to_state_space()
     beyond = s.residual
     variables = {
-        **matrices_of(s), **{f"{letter}_std": std for letter, std in deviations_of(it).items()},
+        **matrices_of(s), **{f"{letter}_std": std for letter, std in content.deviations.items()},
         "G": s.rigid_body, "recovery": s.recovery, "f_hz": s.natural_frequencies[:, None],
         "zeta": s.damping_ratios[:, None], "Phi": s.mode_shapes, "Gamma": s.participation,
         "f_hz_residual": beyond.natural_frequencies[:, None], "zeta_residual": beyond.damping_ratios[:, None],
         "Phi_residual": beyond.shapes, "Gamma_residual": beyond.participation,
         "A": system.A, "B": system.B, "Cy": system.C, "D": system.D,
         "determined": it.determined, "success": it.success,
-        "dof_names": _cells(names_of(it)), "sensor_names": _cells(it.measurement.sensor_names),
+        "dof_names": _cells(content.names), "sensor_names": _cells(content.sensor_names),
         "about": _cells(about),
     }  # fmt: skip
     with path.open("wb") as file:

@@ -7,9 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse
 from sysid.files import units
+from sysid.files.alignment import UnitColumns, clock_moves
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
@@ -264,30 +266,67 @@ def by_folder(recordings: Sequence[Recording], said: Description) -> list[Record
     """The recordings of each folder as one, in the order of the folders.
 
     A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency. Refused are
-    files of other times or rates, or longer than others by more than a hundredth.
+    files of other times or rates, or longer than others by more than a hundredth, unless their clocks are aligned.
     """
     folders = dict.fromkeys(recording.path.parent for recording in recordings)
     return [_together([one for one in recordings if one.path.parent == folder], said) for folder in folders]
 
 
 def _together(recordings: Sequence[Recording], said: Description) -> Recording:
-    first = recordings[0]
-    lengths = [recording.columns[0].values.size for recording in recordings]
-    n = min(lengths)
-    columns = [replace(one, values=one.values[:n]) for one in _abscissa(first, said)]
-    for recording in recordings:
-        _check_same(first, recording, said, n, max(lengths))
-        shared = [id(column) for column in _abscissa(recording, said)]
-        others = [column for column in recording.columns if id(column) not in shared]
-        for column in others:
-            stem = recording.path.stem
-            name = stem if len(others) == 1 else f"{stem}.{column.name}"
-            place = f"{column.place} of {recording.path.name}"
-            columns.append(replace(column, name=name, values=column.values[:n], place=place))
+    first, parts = recordings[0], [_channels(recording, said) for recording in recordings]
     remarks = [f"{one.path.name}: {remark}" for one in recordings for remark in one.remarks]
-    cut = f"{max(lengths)} samples of the longest file are cut to the {n} of the shortest"
-    remarks += [cut] * (max(lengths) > n)
+    lengths = np.array([recording.columns[0].values.size for recording in recordings])
+    if said.align:
+        begins, moved = _begins(recordings, parts, said)
+        remarks += moved
+    else:
+        begins = np.zeros(lengths.size, int)
+        for recording in recordings:
+            _check_same(first, recording, said, min(lengths), max(lengths))
+        cut = f"{max(lengths)} samples of the longest file are cut to the {min(lengths)} of the shortest"
+        remarks += [cut] * bool(np.ptp(lengths))
+    n = min(lengths - begins)
+    columns = [replace(one, values=one.values[:n]) for one in _abscissa(first, said)]
+    for begin, part in zip(begins, parts, strict=True):
+        columns += [replace(column, values=column.values[begin : begin + n]) for column in part]
     return Recording(first.path, tuple(columns), first.sample_rate, first.freq, tuple(remarks))
+
+
+def _channels(recording: Recording, said: Description) -> list[Column]:
+    """The columns of a file beside time or frequency, called as they are in the run."""
+    shared, stem = [id(column) for column in _abscissa(recording, said)], recording.path.stem
+    others = [column for column in recording.columns if id(column) not in shared]
+    named = [stem if len(others) == 1 else f"{stem}.{column.name}" for column in others]
+    places = [f"{column.place} of {recording.path.name}" for column in others]
+    return [replace(one, name=name, place=at) for one, name, at in zip(others, named, places, strict=True)]
+
+
+def _begins(
+    recordings: Sequence[Recording], parts: Sequence[list[Column]], said: Description
+) -> tuple[NDArray[np.intp], list[str]]:
+    """First sample of each file that all have, once their clocks are one, (files,), and their moves in words.
+
+    Whole samples: the rest is a delay, which is found with the modes.
+    """
+    clocks = []
+    for recording, part in zip(recordings, parts, strict=True):
+        rate = _rate(recording, said)  # refuses a time of another unit
+        begin = sum(
+            units.unit(one.unit or "s", one.place).factor * one.values[0] for one in _time_columns(recording, said)
+        )
+        clocks.append(UnitColumns(recording.path.name, begin, rate, part))
+    rates = [clock.rate for clock in clocks]
+    longest = max(part[0].values.size for part in parts)
+    words = (
+        f"{recordings[0].path}: the files of its folder have rates of {min(rates):g} to {max(rates):g} Hz: bring them"
+    )
+    refuse((longest * (max(rates) / min(rates) - 1) > 0.5, f"{words} to one with sysid.resample"))
+    offsets, remarks = clock_moves(clocks, said)
+    begun = np.array([clock.begin for clock in clocks]) + offsets
+    begins = np.rint((begun.max() - begun) * rates[0]).astype(int)
+    left = min(part[0].values.size - begin for part, begin in zip(parts, begins, strict=True))
+    refuse((left < 3, f"{recordings[0].path}: the files of its folder have no time in common on one clock"))
+    return begins, remarks
 
 
 def _abscissa(recording: Recording, said: Description) -> list[Column]:
@@ -299,7 +338,8 @@ def _abscissa(recording: Recording, said: Description) -> list[Column]:
 def _check_same(first: Recording, other: Recording, said: Description, n: int, longest: int) -> None:
     abscissas = _abscissa(first, said), _abscissa(other, said)
     size = other.columns[0].values.size
-    together = "are these files of one run, on one clock? Else read them apart, or bring them to it with sysid.resample"
+    together = "are these files of one run? Clocks of their own are brought to one with --align (align = true); else "
+    together += "read them apart, or bring them to one rate with sysid.resample"
     alike = f"{other.path}, beside {first.path}: one has a column of time or frequency, one has none"
     rates = f"{other.path} has another sample rate than {first.path}: {together}"
     refuse(

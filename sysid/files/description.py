@@ -13,7 +13,7 @@ from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
 _FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "delay", "reference")
-_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join")
+_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join", "align")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
 EXAMPLE = """\
@@ -69,6 +69,8 @@ class Description:
         Of frequency responses, see `sysid.files.responses`; "" where they are to be recognised.
     join : bool
         Whether the files of a folder hold the sensors of one run, instead of a run each.
+    align : bool
+        Whether the files of a run have clocks of their own, which are brought to that of the base.
     """
 
     channels: tuple[Channel, ...] = ()
@@ -80,6 +82,7 @@ class Description:
     frf: str = ""
     convention: str = ""
     join: bool = False
+    align: bool = False
     place: str = "the description"
 
 
@@ -134,7 +137,7 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         base_columns(axes)
     if convention != "":
         choice(f"{place}: convention", convention, CONVENTIONS)
-    join = flag(f"{place}: join", given.get("join", False))
+    join, align = (flag(f"{place}: {name}", given.get(name, False)) for name in ("join", "align"))
     for name in ("time", "frequency"):
         wrong = given.get(name) is not None and not isinstance(given[name], str | int)
         refuse((wrong, f"{place}: {name} must be the name or the number of a column, got {shown(given.get(name))}"))
@@ -143,7 +146,7 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         None if rate is None else as_float(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
         given.get("time"), given.get("frequency"), axes if axes is None or isinstance(axes, str) else " ".join(axes),
         tuple(vector3(given.get("origin", (0.0, 0.0, 0.0)), f"{place}: origin").tolist()),
-        given.get("frf", ""), convention, join, place,
+        given.get("frf", ""), convention, join, align, place,
     )  # fmt: skip
 
 

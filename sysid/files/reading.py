@@ -72,11 +72,12 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         _check_file(file)
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
-        return assembly.assembled_in_time([xsens_dot.together(files)], said)  # a unit is a file
+        return assembly.assembled_in_time([xsens_dot.together(files, said)], said)  # a unit is a file
     recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
         recordings = assembly.by_folder(recordings, said)
     else:
+        refuse((said.align, f"{said.place}: align goes with join: a file of its own is on one clock"))
         _check_one_each(recordings, said)
     recordings = [recognised(recording, said) for recording in recordings]
     spectra = {recording.freq is not None for recording in recordings}

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sysid.errors import InputError, refuse
+from sysid.files.alignment import UnitColumns, clock_moves
+from sysid.files.description import Description
 from sysid.files.recording import Column, Recording
 from sysid.measurement.spectra import resample
 from sysid.structure.structure import Array
@@ -35,6 +37,11 @@ class UnitRecord:
     time: Array
     acceleration: Array
     rotation_rate: Array
+
+    @property
+    def sample_rate(self) -> float:
+        """Mean rate of the samples, Hz."""
+        return float((self.time.size - 1) / (self.time[-1] - self.time[0]))
 
 
 def read_xsens_dot(path: str | Path) -> UnitRecord:
@@ -88,14 +95,27 @@ def is_export(path: Path) -> bool:
         return False
 
 
-def together(paths: Sequence[Path]) -> Recording:
+def together(paths: Sequence[Path], said: Description) -> Recording:
     """The units of one run, a file each, on one clock: columns such as ``ground.Acc_X``, without their means."""
     records = [read_xsens_dot(path) for path in paths]
-    time, found = resample([(record.time, record.acceleration) for record in records])
-    columns = tuple(
-        Column(f"{path.stem}.{name}", values - values.mean(), "m/s²", f"{path.stem}.{name}")
-        for path, unit in zip(paths, found, strict=True)
-        for name, values in zip(_ACCELERATION, unit, strict=True)
-    )
+    times, moved = [record.time for record in records], list[str]()
+    if said.align:
+        parts = zip(paths, records, strict=True)
+        units = [UnitColumns(p.name, one.time[0], one.sample_rate, _columns(p, one.acceleration)) for p, one in parts]
+        offsets, moved = clock_moves(units, said)
+        times = [time + offset for time, offset in zip(times, offsets, strict=True)]
+    apart = max(time[0] for time in times) >= min(time[-1] for time in times)
+    remedy = "" if said.align else ": units on clocks of their own are brought to one with --align (align = true)"
+    refuse((apart, f"{', '.join(path.name for path in paths)} have no time in common{remedy}"))
+    time, found = resample([(own, record.acceleration) for own, record in zip(times, records, strict=True)])
+    columns = tuple(one for path, unit in zip(paths, found, strict=True) for one in _columns(path, unit))
     remark = f"{len(paths)} units are brought to one clock; gravity and offsets are taken off: the mean of each channel"
-    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=(remark,))
+    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=(*moved, remark))
+
+
+def _columns(path: Path, acceleration: Array) -> list[Column]:
+    """The channels of a unit without their means."""
+    return [
+        Column(f"{path.stem}.{name}", values - values.mean(), "m/s²", f"{path.stem}.{name}")
+        for name, values in zip(_ACCELERATION, acceleration, strict=True)
+    ]

@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError, finite_array, listed, refuse
-from sysid.models.unknowns import Variable, expression_of, refuse_complex, user_site, variable_of
+from sysid.models.complex_expressions import ComplexExpression
+from sysid.models.unknowns import NO_COMPLEX, Variable, expression_of, refuse_complex, user_site, variable_of
 from sysid.structure.structure import Array
 
 
@@ -28,11 +29,14 @@ def _is_objects(value: Any) -> bool:
 def as_matrix(name: str, value: Any) -> ca.MX:
     """An expression, numbers or rows of both, as an expression."""
     value = _without_sx(name, value)
+    if isinstance(value, ComplexExpression):
+        raise InputError(f"{name} ({user_site()}): {NO_COMPLEX}")
     if isinstance(value, ca.MX | ca.DM):
         return ca.MX(value)
     if _is_objects(value):
         value = value.tolist()
     if isinstance(value, list | tuple) and is_expression(value):
+        refuse_complex(value)
         rows = [row if isinstance(row, list | tuple) else [row] for row in value]
         entries = [[_entry(name, entry) for entry in row] for row in rows]
         try:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, flag, numbers, printable, refuse, shown, text
+from sysid.models.complex_expressions import as_complex, by_numpy, is_complex
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
@@ -32,9 +33,10 @@ NO_NUMBER = (
 )
 NO_CHANGE = "an entry of what is written in variables is not changed in place: write all entries, ca.vertcat(a, b, c)"
 NO_COMPLEX = (
-    "complex numbers meet an expression in variables, and CasADi has real ones only: write two real expressions, of a "
-    "record as [record.real - real, record.imag - imag], of exp(-1j * a) as ca.cos(a) and -ca.sin(a); of a stiffness "
-    "K * (1 + 1j * eta) give K, and damping=[eta / 2, ...], a ratio a mode"
+    "complex numbers meet an expression in variables, and CasADi has real ones only: a complex residual is "
+    "sysid.real_and_imaginary(record - response); elsewhere write two real expressions, of a record as [record.real - "
+    "real, record.imag - imag], of exp(-1j * a) as ca.cos(a) and -ca.sin(a); of a stiffness K * (1 + 1j * eta) give K, "
+    "and damping=[eta / 2, ...], a ratio a mode"
 )
 
 
@@ -161,14 +163,20 @@ def _from_the_right(operation: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _closed(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of `Expression` that does as CasADi's, gives an `Expression`, and refuses complex numbers."""
+    """A method of `Expression` that does as CasADi's, and gives an `Expression` or, beside complex numbers, a pair."""
 
     def closed(self: ca.MX, *others: Any) -> Any:
+        if method.__name__ in _ARITHMETIC and any(map(is_complex, others)):
+            return getattr(as_complex(self), method.__name__)(*others)
         refuse_complex(others)
         result = method(self, *map(expression_of, others))
         return Expression(result) if isinstance(result, ca.MX) else result
 
     return closed
+
+
+_OPERATIONS = ("add", "sub", "mul", "truediv", "matmul")
+_ARITHMETIC = {f"__{side}{name}__" for side in ("", "r") for name in _OPERATIONS}  # that complex numbers have
 
 
 class Expression(ca.MX):
@@ -191,6 +199,8 @@ class Expression(ca.MX):
         return int(float(self))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        if any(map(is_complex, inputs)):
+            return by_numpy(ufunc, inputs)
         return _closed(lambda _, *given: ca.MX.__array_ufunc__(self, ufunc, method, *given, **options))(self, *inputs)
 
     __getitem__ = _closed(ca.MX.__getitem__)
@@ -208,10 +218,9 @@ class Expression(ca.MX):
 
 
 def refuse_complex(operands: Iterable[Any]) -> None:
-    """Refuse complex numbers, arrays of them too, beside an expression."""
-    for one in operands:
-        if isinstance(one, complex) or (isinstance(one, np.ndarray | np.generic) and one.dtype.kind == "c"):
-            raise InputError(f"{user_site()}: {NO_COMPLEX}")
+    """Refuse complex numbers, arrays of them and complex expressions too, where real ones are needed."""
+    if any(map(is_complex, operands)):
+        raise InputError(f"{user_site()}: {NO_COMPLEX}")
 
 
 class Variable(Unknown):

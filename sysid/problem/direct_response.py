@@ -12,18 +12,17 @@ moves the accelerations by :math:`dX = Z^{-1} (\omega^2 dB - dZ\, X)`; modes fol
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, index_of, matched, theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import parts_of, weights_of_test
-from sysid.models.unknowns import NO_COMPLEX, user_site
+from sysid.models.complex_expressions import ComplexExpression
 from sysid.problem.matrices import Matrices, Motion
 from sysid.problem.residual_terms import ResidualTerms
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -32,18 +31,9 @@ from sysid.structure.thresholds import ROUND_OFF
 _SOLVER = "lapacklu"  # of the wheels' plugins the fastest on small dense systems
 
 
-class Response(NamedTuple):
-    """A response as expressions: real and imaginary part, (channels, runs * n_freq), the runs side by side."""
-
-    real: ca.MX
-    imag: ca.MX
-
-    def __array_ufunc__(self, *operation: Any, **options: Any) -> None:
-        """Refuse an operation with an array, such as a complex record."""
-        raise InputError(f"{user_site()}: {NO_COMPLEX}")
-
-
-def relative_response(test: Measurement, motion: Motion, *, shift: float = 0.0) -> tuple[Response, Response]:
+def relative_response(
+    test: Measurement, motion: Motion, *, shift: float = 0.0
+) -> tuple[ComplexExpression, ComplexExpression]:
     """Accelerations of the degrees of freedom relative to the base under a test's base motion, and the base force.
 
     (n, runs * n_freq) in m/s², and (d, runs * n_freq) in N. With `shift`, 1/s, at the complex frequencies
@@ -68,24 +58,24 @@ def relative_response(test: Measurement, motion: Motion, *, shift: float = 0.0) 
             re, im = re + H_re * x_re - H_im * x_im, im + H_re * x_im + H_im * x_re
         real.append(re)
         imag.append(im)
-    a = Response(ca.horzcat(*real), ca.horzcat(*imag))
+    a = ComplexExpression(ca.horzcat(*real), ca.horzcat(*imag))
     push, rigid = motion.push, motion.rigid_body_mass
-    return a, Response(push.T @ a.real + rigid @ u_re, push.T @ a.imag + rigid @ u_im)
+    return a, ComplexExpression(push.T @ a.real + rigid @ u_re, push.T @ a.imag + rigid @ u_im)
 
 
-def absolute_response(test: Measurement, motion: Motion) -> Response:
+def absolute_response(test: Measurement, motion: Motion) -> ComplexExpression:
     """Absolute accelerations of the sensors under a test's base motion, (n_sensors, runs * n_freq), m/s²."""
     a, _ = relative_response(test, motion)
     R, G = ca.DM(motion.recovery), ca.DM(test.rigid_body)
     u_re, u_im = parts_of(test.base)
-    return Response(R @ a.real + G @ u_re, R @ a.imag + G @ u_im)
+    return ComplexExpression(R @ a.real + G @ u_re, R @ a.imag + G @ u_im)
 
 
 def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False, shift: float = 0.0) -> ca.MX:
     """Relative residuals, stacked, as `response.residual` has them: of accelerations, then of a measured force."""
     a, f = relative_response(test, motion, shift=shift)
     R = ca.DM(motion.recovery)
-    records = [(test.relative, Response(R @ a.real, R @ a.imag))]
+    records = [(test.relative, ComplexExpression(R @ a.real, R @ a.imag))]
     records += [] if test.force is None else [(test.force, f)]
     pieces: list[ca.MX] = []
     for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ from sysid.problem.matrices import MATRICES, Blocks, Matrices, blocks_of, symbol
 from sysid.problem.residual_terms import ResidualTerms
 from sysid.problem.terms import (
     Builder,
+    ComplexResidual,
     ExpressionTerm,
     FurtherTest,
     Prior,
@@ -119,7 +121,8 @@ class Formulation:
         self.models, self.geometry, self.residual_modes = models, geometry, residual_modes
         self.sources: list[tuple[str, TermSource]] = []
         if misfit is not None:
-            self.sources.append(("misfit", Residual(misfit, is_misfit=True)))
+            own = misfit if isinstance(misfit, ComplexResidual) else Residual(misfit)
+            self.sources.append(("misfit", replace(own, is_misfit=True)))
         self.sources += [
             (f"residual {i}", given if isinstance(given, TermSource) else Residual(given))
             for i, given in enumerate(residuals, start=1)
@@ -302,6 +305,7 @@ class Formulation:
         build = Builder(
             self._function, self._matrices, lambda: self.matrices, lambda: self.noise,
             self._of_further.__getitem__, lambda test: noise_level(test, monitor=self.monitor), not self.fits_records,
+            lambda: self._modal.records,
         )  # fmt: skip
         return tuple(source.term(name, build) for name, source in self.sources)
 

@@ -26,7 +26,7 @@ from sysid.models.unknowns import Variable, variable_of
 from sysid.problem.decoding import decode
 from sysid.problem.encoding import NotStorableError, encode
 from sysid.problem.matrices import MATRICES
-from sysid.problem.terms import FurtherTest, Prior
+from sysid.problem.terms import ComplexResidual, FurtherTest, Prior
 
 # A problem module that is a file has a name of its own in Python: this, eight digits, and the name of the file.
 PROBLEM_MODULE = "_sysid_problem_"
@@ -160,7 +160,7 @@ def to_tree(given: Mapping[str, Any]) -> Tree:
         "constraints": np.array(
             [outputs.add(f"constraint {i}", c) for i, c in enumerate(given.get("constraints", ()), start=1)], np.int64
         ),
-        "misfit": outputs.add("misfit", given.get("misfit")),
+        "misfit": _misfit_to_tree(given.get("misfit"), outputs),
         "healing": [
             {"variable": variable.name, "expression": outputs.add("healing", expression)}
             for variable, expression in given.get("healing", {}).items()
@@ -189,7 +189,7 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         **_matrices_from_tree(tree, outputs),
         "residuals": [_residual_from_tree(part, outputs) for part in tree["residuals"]],
         "constraints": [outputs[i] for i in tree["constraints"].tolist()],
-        "misfit": outputs[tree["misfit"]],
+        "misfit": _misfit_from_tree(tree["misfit"], outputs),
         "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
     }
 
@@ -290,6 +290,8 @@ def _residual_to_tree(number: int, value: Any, outputs: _Outputs) -> Tree:
     if isinstance(value, Prior):
         numbers = {part: np.array(getattr(value, part), dtype=float) for part in ("value", "std")}
         return {"kind": "prior", "expression": outputs.add(name, value.expression), **numbers}
+    if isinstance(value, ComplexResidual):
+        return {"kind": "complex", "expression": outputs.add(name, value.stacked), "force": value.force}
     if is_storable(value):
         return {"kind": "own", "source": model_to_tree(value)}
     return {"kind": "rows", "expression": outputs.add(name, value)}
@@ -300,7 +302,20 @@ def _residual_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Any:
         return FurtherTest(Measurement.from_tree(tree["measurement"]), **_matrices_from_tree(tree, outputs))
     if tree["kind"] == "prior":
         return Prior(outputs[tree["expression"]], tree["value"], tree["std"])
+    if tree["kind"] == "complex":
+        return ComplexResidual(outputs[tree["expression"]], bool(tree["force"]))
     return _model_from_tree(tree["source"]) if tree["kind"] == "own" else outputs[tree["expression"]]
+
+
+def _misfit_to_tree(value: Any, outputs: _Outputs) -> Any:
+    """The number of a misfit of the user's, or of a complex one a dictionary; None where there is none."""
+    if not isinstance(value, ComplexResidual):
+        return outputs.add("misfit", value)
+    return {"kind": "complex", "expression": outputs.add("misfit", value.stacked), "force": value.force}
+
+
+def _misfit_from_tree(tree: Any, outputs: Mapping[int | None, Any]) -> Any:
+    return _residual_from_tree(tree, outputs) if isinstance(tree, dict) else outputs[tree]
 
 
 def _model_from_tree(tree: Tree) -> Any:

@@ -14,17 +14,17 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, instance, refuse
+from sysid.errors import InputError, finite_array, flag, instance, refuse
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate, misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
+from sysid.models.complex_expressions import ComplexExpression
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.model import Geometry
 from sysid.models.unknowns import Expression, user_site, variable_of
 from sysid.problem.batch import TestObjective
 from sysid.problem.direct_response import (
-    Response,
     Rows,
     Slopes,
     absolute_response,
@@ -235,7 +235,8 @@ class Builder(NamedTuple):
     ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
     ``problem_matrices()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's
     relative residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further
-    test; ``replaced`` tells whether a misfit stands in the place of the measurement's.
+    test; ``replaced`` tells whether a misfit stands in the place of the measurement's; ``records()`` are the problem's
+    own.
     """
 
     function: Callable[[str, Sequence[ca.MX]], ca.Function]
@@ -245,6 +246,7 @@ class Builder(NamedTuple):
     modal_of: Callable[[FurtherTest], ModalEstimate]
     noise_of: Callable[[Measurement], float]
     replaced: bool
+    records: Callable[[], Measurement]
 
 
 @runtime_checkable
@@ -309,12 +311,12 @@ class FurtherTest:
         return TestTerm(modal, build.matrices(*self.blocks), weight, name=name)
 
     @property
-    def response(self) -> Response:
+    def response(self) -> ComplexExpression:
         """Absolute accelerations of the sensors as expressions, (n_sensors, runs * n_freq)."""
         return _as_expressions(absolute_response(self.measurement, self.blocks[0].motion(self.blocks[1])))
 
     @property
-    def force(self) -> Response:
+    def force(self) -> ComplexExpression:
         """The base force as expressions, (d, runs * n_freq)."""
         return _as_expressions(relative_response(self.measurement, self.blocks[0].motion(self.blocks[1]))[1])
 
@@ -398,9 +400,76 @@ class Residual:
         return ExpressionTerm(name, function, like_records=not self.is_misfit)
 
 
-def _as_expressions(response: Response) -> Response:
+@dataclass(frozen=True, eq=False)
+class ComplexResidual:
+    """A complex residual of accelerations, m/s², or of the force, N, weighed as the records of the problem's own test.
+
+    `stacked` are real and, below, imaginary parts, (2 n_sensors or 2 d, runs * n_freq).
+    """
+
+    stacked: Any
+    force: bool = False
+    is_misfit: bool = False
+
+    def expressions(self, name: str) -> Sequence[ca.MX]:
+        """The parts in one column, not weighed."""
+        return [column_of(name, self.stacked)]
+
+    def term(self, name: str, build: Builder) -> ExpressionTerm:
+        """Rows relative to the record, each channel and line by its noise."""
+        test, stacked = build.records(), as_matrix(name, self.stacked)
+        refuse((self.force and test.force is None, f"{name}: force=True, and the test has no base force"))
+        weight, size = weights_of_test(test, weighted=True)[self.force]
+        wanted, given = weight.shape, (stacked.shape[0] // 2, stacked.shape[1])
+        words = f"a row a {'direction' if self.force else 'sensor'} and a column a line, runs side by side, are needed"
+        refuse((given != wanted, f"{name}: its complex residual is {given}; {wanted}, {words}{written_in(stacked)}"))
+        column = column_of(name, ca.DM(np.vstack([weight, weight]) / size) * stacked)
+        return ExpressionTerm(name, build.function("residuals", [column]), like_records=not self.is_misfit)
+
+
+def real_and_imaginary(expression: Any, *, force: bool = False) -> ComplexResidual:
+    """One term of a complex residual, with the records' noise: for `misfit` or among the `residuals` of a problem.
+
+    Parameters
+    ----------
+    expression : complex expression, (n_sensors, runs * n_freq)
+        Of accelerations, m/s², such as ``record - gain * response``: variables, complex numbers and the `response` of a
+        `FurtherTest` take + - * / @, `numpy.exp` and `numpy.conj`. Runs stand side by side.
+    force : bool
+        True for a residual of the base force, N, (d, runs * n_freq).
+
+    Returns
+    -------
+    ComplexResidual
+        Real and imaginary part of each channel and line count by the noise of that record, as those of the test do.
+
+    Raises
+    ------
+    InputError
+        Where the expression is real.
+
+    Examples
+    --------
+    A delay of all sensors as an unknown:
+
+    >>> import numpy as np
+    >>> import sysid
+    >>> truth = sysid.Structure(np.diag([2.0, 0.0]), [[800.0, -800.0], [-800.0, 800.0]], [0.02], n_base=1)
+    >>> test = sysid.simulate(truth, np.linspace(1, 6, 40))
+    >>> k = sysid.Variable("k", lower=500.0, upper=1500.0)
+    >>> tau = sysid.Variable("tau", lower=-0.01, upper=0.01)
+    >>> a = sysid.FurtherTest(test, mass=[[2.0]], stiffness=k, damping=[[1.6]]).response
+    >>> late = np.exp(-2j * np.pi * test.freq[None] * tau) * a
+    >>> term = sysid.real_and_imaginary(late - test.response[0])
+    """
+    if not isinstance(expression, ComplexExpression):
+        raise InputError(f"real_and_imaginary ({user_site()}): the expression is real; it is a residual as it stands")
+    return ComplexResidual(Expression(ca.vertcat(*expression)), flag("force", force))
+
+
+def _as_expressions(response: ComplexExpression) -> ComplexExpression:
     """The same response, whose parts tell where complex numbers meet them."""
-    return Response(*map(Expression, response))
+    return ComplexExpression(*map(Expression, response))
 
 
 def column_of(name: str, value: Any) -> ca.MX:

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.export.content import entry_unit, matrices_of, reliability, rotations_of
+from sysid.export.content import Content, _turned, entry_unit, matrices_of, reliability
 from sysid.export.state_space import control_system
 from sysid.finding import Finding, Severity
 
@@ -47,7 +47,7 @@ def test_a_table_keeps_every_number_and_tells_units_and_judgement(result, tmp_pa
         "N s",
         "N s m",
     }
-    assert rows[3]["column_name"] == "base x" and rows[3]["row_name"] == "floor 1"
+    assert rows[3]["column_name"] == "base x" and rows[3]["row_name"] == "floor 1 (x)"
     head = "\n".join(line for line in lines if line.startswith("#"))
     assert "judgement: " in head and "units: " in head and sysid.__version__ in head
 
@@ -57,7 +57,8 @@ def test_a_matlab_file_keeps_every_number(result, tmp_path):
     s, system = result.structure, result.structure.to_state_space()
     for name, value in {"M": s.mass, "K": s.stiffness, "Phi": s.mode_shapes, "G": s.rigid_body, "A": system.A}.items():
         assert np.array_equal(read[name], value), name
-    assert [str(cell[0]) for cell in read["dof_names"][:, 0]] == ["floor 1", "floor 2", "floor 3", "base x", "base ry"]
+    floors = [f"floor {k} (x)" for k in (1, 2, 3)]
+    assert [str(cell[0]) for cell in read["dof_names"][:, 0]] == [*floors, "base x", "base ry"]
     assert any(str(cell[0]).startswith("judgement: ") for cell in read["about"][:, 0])
 
 
@@ -89,7 +90,7 @@ def test_a_coordinate_that_no_sensor_records_has_no_unit(result):
     s = result.structure
     between = [[1, 0, 0], [0, 1, 0], [0, 0.5, 0.5]]  # the third sensor sees two coordinates
     other = sysid.Structure(s.mass, s.stiffness, s.damping_ratios, n_base=2, recovery=between)
-    kinds = rotations_of(replace(result, structure=other))
+    kinds = Content.of(replace(result, structure=other)).rotations
     assert kinds == (False, False, None, False, True)
     assert [entry_unit("M", kinds[0], kinds[j]) for j in range(5)] == ["kg", "kg", "", "kg", "kg m"]
     assert entry_unit("K", True, True) == "N m" and entry_unit("C", True, None) == ""
@@ -171,3 +172,65 @@ def test_the_command_warns_in_one_line_of_matrices_that_are_not_determined(
     (line,) = said.err.splitlines()
     assert line.startswith("sysid: warning: m.csv: ") and all(word in line for word in told)
     assert "m.csv" in said.out
+
+
+@pytest.fixture(scope="module")
+def upside_down(result):
+    """The result as its second sensor, at the other end of its axis, would have given it, and sensors of two axes."""
+    signs = np.array([1.0, -1.0, 1.0])
+    s, test = result.structure, result.measurement
+    both = np.concatenate([signs, np.ones(2)])
+    sensors = [replace(one, axis="-x" if sign < 0 else one.axis) for one, sign in zip(test.sensors, signs, strict=True)]
+    records = sysid.Measurement(
+        test.freq, test.base, test.response * signs[:, None], force=test.force, sensors=sensors, base_axes="x ry",
+        rigid_body=test.rigid_body * signs[:, None],
+    )  # fmt: skip
+    problem = sysid.Problem(records, mass=sysid.FullMass(), stiffness=sysid.SpectralStiffness())
+    return np.outer(both, both), s, sysid.identify(problem)
+
+
+@pytest.mark.parametrize("positive", [False, True])
+def test_rows_name_their_axis_and_sign_and_are_turned_on_request(upside_down, tmp_path, positive):
+    signs, s, found = upside_down
+    signs = np.ones_like(signs) if positive else signs
+    rows, values, deviations = read_table(sysid.export(found, tmp_path / "m.csv", positive_axes=positive))
+    mat = loadmat(sysid.export(found, tmp_path / "m.mat", positive_axes=positive))
+    for letter, matrix in matrices_of(s).items():
+        for read in (values[letter], mat[letter]):
+            np.testing.assert_allclose(read, signs * matrix, atol=1e-6 * np.abs(matrix).max())
+    second = "floor 2 (x)" if positive else "floor 2 (-x)"
+    assert {row["row_name"] for row in rows if row["row"] == "2"} == {second}
+    assert str(mat["dof_names"][1, 0][0]) == str(mat["sensor_names"][1, 0][0]) == second
+    np.testing.assert_array_equal(deviations["K"], mat["K_std"])
+    about = [str(cell[0]) for cell in mat["about"][:, 0]]
+    assert any("turned" in line and "floor 2 (-x)" in line for line in about) == positive
+    system, plain = control_system(found, positive_axes=positive), s.to_state_space()
+    assert system.output_labels == ["floor 1 (x)", second, "floor 3 (x)"]
+    gain = signs[1, 0] * plain.D
+    np.testing.assert_allclose(system.D[1], gain[1], atol=1e-6 * np.abs(plain.D).max())
+
+
+def test_turned_rows_answer_like_the_turned_sensors(upside_down):
+    _, s, found = upside_down
+    turned, f = Content.of(found, True).structure, np.linspace(3.0, 30.0, 20)
+    for name in ("transmissibility", "base_force"):
+        wanted = getattr(s, name)(f)
+        np.testing.assert_allclose(getattr(turned, name)(f), wanted, atol=1e-6 * np.abs(wanted).max())
+
+
+def test_residual_modes_and_coordinates_of_no_sensor_are_turned_with_the_sensors(in_band):
+    signs = np.array([1.0, -1, 1, -1, -1, 1])
+    axes = ["x" if sign > 0 else "-x" for sign in signs]
+    described = [sysid.Sensor(f"s{k}", (0, 0, k), axis) for k, axis in enumerate(axes)]
+    content = Content(in_band, in_band.structure, tuple(described))
+    turned = _turned(in_band.structure, signs, tuple(described))
+    f = np.linspace(5.0, 30.0, 30)
+    wanted = in_band.structure.transmissibility(f) * signs[:, None, None]
+    np.testing.assert_allclose(turned.transmissibility(f), wanted, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(turned.base_force(f), in_band.structure.base_force(f), rtol=1e-9, atol=1e-9)
+    assert [name.endswith("(-x)") for name in content.sensor_names] == [sign < 0 for sign in signs]
+
+
+def test_positive_axes_of_sensors_that_are_not_described_are_refused(noisy, tmp_path):
+    with pytest.raises(sysid.InputError, match="describe"):
+        sysid.export(noisy[1], tmp_path / "m.csv", positive_axes=True)

@@ -134,4 +134,4 @@ def test_python_control_answers_as_identified(result):
     right = result.structure.transmissibility(FREQ)
     assert np.abs(answer - right).max() < 1e-10 * np.abs(right).max()
     assert system.input_labels == ["base x", "base ry"]
-    assert system.output_labels == ["floor 1", "floor 2", "floor 3"]
+    assert system.output_labels == ["floor 1 (x)", "floor 2 (x)", "floor 3 (x)"]

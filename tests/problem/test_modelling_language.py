@@ -48,20 +48,25 @@ SYMBOLIC = {
     "an if on a variable itself": (lambda k, z: 1 if k else 2, "ca.if_else"),
     "the larger of two": (lambda k, z: max(k[0], k[1]), "ca.fmax(a, b)"),
     "both of two": (lambda k, z: (k[0] <= k[1]) and (k[1] <= k[2]), "of `a and b` [a, b]"),
-    "complex after an operation": (lambda k, z: (2 * k[0] + np.exp(z)) * (1 + 0.02j), "damping=[eta / 2"),
-    "complex after a product of matrices": (lambda k, z: 1j * (T.T @ k), "real ones only"),
-    "a complex variable": (lambda k, z: k * (1 + 1j * z), "damping=[eta / 2"),
-    "a complex exponential": (lambda k, z: np.exp(-1j * z), "ca.cos(a) and -ca.sin(a)"),
-    "a phase a line": (lambda k, z: np.exp(-2j * np.pi * FREQ * z), "ca.cos(a) and -ca.sin(a)"),
-    "a record less an expression": (lambda k, z: TEST.response[0, 0, 0] - k[0], "record.real - real"),
-    "an expression less records": (lambda k, z: k - TEST.response[:, 0, 0], "record.real - real"),
-    "records less a response": (
-        lambda k, z: TEST.response[:, 0] - sysid.FurtherTest(TEST, mass=M, stiffness=chain(k), damping=M).response,
-        "record.real - real",
+    "a complex stiffness": (lambda k, z: build(stiffness=(1 + 0.02j * z) * chain(k)), "damping=[eta / 2"),
+    "a complex damping of a variable": (lambda k, z: build(stiffness=chain(k), damping=1j * k), "real ones only"),
+    "a complex ratio of variables": (
+        lambda k, z: build(stiffness=chain(k), damping=[0.01, 0.01, 1j * z]), "damping=[eta / 2"
     ),
-    "records less the real part of a response": (
-        lambda k, z: TEST.response[:, 0] - sysid.FurtherTest(TEST, mass=M, stiffness=chain(k), damping=M).response.real,
-        "record.real - real",
+    "a complex exponential in a mass": (
+        lambda k, z: build(stiffness=chain(k), mass=np.exp(-1j * z) * M), "ca.cos(a) and -ca.sin(a)"
+    ),
+    "a complex relation": (lambda k, z: k[0] <= 1j, "real ones only"),
+    "a complex power": (lambda k, z: k**1j, "real ones only"),
+    "records less a response among residuals": (
+        lambda k, z: build(
+            stiffness=chain(k),
+            residuals=[TEST.response[0] - sysid.FurtherTest(TEST, mass=M, stiffness=chain(k), damping=M).response],
+        ),
+        "sysid.real_and_imaginary(record - response)",
+    ),
+    "records less an expression in place of the misfit": (
+        lambda k, z: build(stiffness=chain(k), misfit=TEST.response[0, 0, :3] - k), "sysid.real_and_imaginary(record"
     ),
     "a complex entry": (
         lambda k, z: build(stiffness=[[k[0], 1j, 0], [1j, k[1], 0], [0, 0, k[2]]]), "real ones only"

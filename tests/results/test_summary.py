@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
-from sysid.export.content import statements
+from sysid.export.content import Content, statements
 from sysid.finding import Finding, Severity
 from sysid.results.summary import next_steps, verdict
 
@@ -258,8 +258,8 @@ def test_what_is_determined_without_a_force_is_told_to_rest_on_what_is_stated():
     further = sysid.FurtherTest(forced, mass=M, stiffness=K[:2, :2], damping=np.eye(2))
     both = sysid.Problem(test, mass=sysid.LumpedMass(3.0), residuals=[further])
     assert unforced not in verdict(dataclasses.replace(right, problem=both))
-    assert any(told.startswith(assumed) for told in statements(twice, ""))
-    assert not any(told.startswith("assumed: ") for told in statements(of_force, ""))
+    assert any(told.startswith(assumed) for told in statements(Content.of(twice), ""))
+    assert not any(told.startswith("assumed: ") for told in statements(Content.of(of_force), ""))
 
 
 @pytest.mark.parametrize(("mass", "scale"), [(sysid.LumpedMass(), True), (sysid.FullMass(), False)])
