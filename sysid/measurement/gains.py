@@ -45,19 +45,32 @@ def seen_at_sensors(test: Measurement) -> Array:
     return np.hstack([np.eye(n), -share, np.zeros((n, d))])
 
 
-def tolerances_at_sensors(test: Measurement) -> Array:
-    """What independent standard normals make of the sensors' gains against the base, (n_sensors, k).
+def read_by_gains(test: Measurement) -> Array:
+    """What errors of gains, in units of tolerances, make of the channels, (n_sensors [+ d], d, k), to first order.
 
-    Those of the tolerances that are not zero; the force's make nothing of them.
+    A sensor's ``G_ij u_j`` takes its own factor, and is less by that of the base; its modes' shapes are free to take
+    it. A force takes that of its gain, and that of the base's, by which the loads of the modes are less: of any base
+    direction the same. Gains without a tolerance are left out.
     """
-    moves = seen_at_sensors(test) * tolerance_of(test)
-    return np.asarray(moves[:, np.any(moves != 0, axis=0)])
+    n, d = test.rigid_body.shape
+    moves = np.zeros((n + d, d, n + 2 * d))
+    i, j = np.arange(n), np.arange(d)
+    moves[i, :, i] = 1.0
+    moves[:n, j, n + j] = -1.0
+    for kind in (1, 2):
+        moves[n + j, :, kind * d - d + n + j] = 1.0
+    tolerance = tolerance_of(test)
+    kept = tolerance > 0
+    if test.force is None:
+        moves, kept[n + d :] = moves[:n], False
+    return moves[..., kept] * tolerance[kept]
 
 
 def without_gains(test: Measurement, errors: Array) -> Measurement:
     """The test with each record divided by one and the relative error of its gain, order as in `tolerance_of`.
 
-    Functions for unit motion of the base stay so: they are per what the base recorded.
+    What tolerances were stated of them is gone. Functions for unit motion of the base stay so: they are per what the
+    base recorded.
     """
     n, d = test.rigid_body.shape
     sensors, base, force = np.split(1 + errors[:, None], [n, n + d])
@@ -68,4 +81,5 @@ def without_gains(test: Measurement, errors: Array) -> Measurement:
     return replace(
         test, response=test.response * run / sensors, base=test.base / base, force=read(test.force, force),
         response_std=read(test.response_std, sensors), force_std=read(test.force_std, force),
+        gain_std=np.zeros(n), base_gain_std=np.zeros(d), force_gain_std=np.zeros(d),
     )  # fmt: skip

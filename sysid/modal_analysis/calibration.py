@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,15 @@ class Calibration:
 
     Attributes
     ----------
+    tolerance : (k,)
+        Their standard deviations as stated.
     values : (k,)
         The likeliest, which are taken off the records.
     covariance : (k, k)
         Of what is left.
     """
 
+    tolerance: Array
     values: Array
     covariance: Array
 
@@ -33,7 +36,7 @@ class Calibration:
     def stated(cls, test: Measurement) -> Calibration | None:
         """That of the tolerances alone; None where all gains are exact."""
         std = tolerance_of(test)
-        return cls(np.zeros(std.size), np.diag(std**2)) if np.any(std) else None
+        return cls(std, np.zeros(std.size), np.diag(std**2)) if np.any(std) else None
 
     def taken_off(self, test: Measurement) -> Measurement:
         """The test without these errors."""
@@ -48,8 +51,9 @@ class Calibration:
         H = seen_at_sensors(test)[known]
         across = self.covariance @ H.T
         gain = across @ np.linalg.pinv(H @ across + np.diag(std[known] ** 2), hermitian=True)
-        return Calibration(
-            self.values + gain @ (error[known] - H @ self.values), self.covariance - gain @ across.T,
+        return replace(
+            self, values=self.values + gain @ (error[known] - H @ self.values),
+            covariance=self.covariance - gain @ across.T,
         )  # fmt: skip
 
     @property
@@ -60,7 +64,7 @@ class Calibration:
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `stored_calibrations` takes them back."""
-        return {"values": self.values, "covariance": self.covariance}
+        return {"tolerance": self.tolerance, "values": self.values, "covariance": self.covariance}
 
 
 def stored_calibrations(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Calibration | None]:
@@ -70,7 +74,7 @@ def stored_calibrations(tree: dict[str, Any], tests: Sequence[Measurement]) -> l
         stated = Calibration.stated(test)
         if one is not None:
             k = test.n_sensors + 2 * test.n_base
-            sound = [np.shape(one["values"]), np.shape(one["covariance"])] == [(k,), (k, k)]
+            sound = [np.shape(one[name]) for name in ("tolerance", "values", "covariance")] == [(k,), (k,), (k, k)]
             sound = sound and all(np.all(np.isfinite(part)) for part in one.values())
             refuse((not sound or stated is None, "the stored gains are of another test, or hold what is no number"))
             stated = Calibration(**one)

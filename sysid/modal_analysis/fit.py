@@ -34,6 +34,7 @@ from sysid.modal_analysis.record_fit import (
     without,
 )
 from sysid.modal_analysis.residual_tests import (
+    calibration_of,
     delays_left,
     delays_of,
     excess_of,
@@ -265,17 +266,27 @@ def fit_modes(
         turned = test if values is None else without_delays(test, values)
         return replace(ModalEstimate.of_lines(turned), delays=delays, calibration=calibration)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        return estimate(whole_fit(test, values, monitor=monitor), calibration)
+        fit = whole_fit(test, values, monitor=monitor)
+        if calibration is not None and not (fit.stopped or np.any(calibration.values)):
+            fit, calibration = _calibrated(fit, calibration, monitor)
+        return estimate(fit, calibration)
 
 
-def calibrated(modal: ModalEstimate, calibration: Calibration, monitor: FitMonitor) -> ModalEstimate:
-    """The estimate of a test from which nothing was taken off yet, without these errors of its gains."""
-    fit = modal.record_fit
-    if fit is None:
-        turned = ModalEstimate.of_lines(calibration.taken_off(modal.records))
-        return replace(turned, delays=modal.delays, calibration=calibration)
-    with one_thread():
-        return estimate(on_turned(fit, calibration.taken_off(fit.test), monitor=monitor), calibration)
+def _calibrated(
+    fit: RecordFit, stated: Calibration, monitor: FitMonitor | None
+) -> tuple[RecordFit, Calibration]:  # fmt: skip
+    """The fit once more without the errors of gains that it makes likely within tolerances."""
+    found = calibration_of(fit, stated)
+    try:
+        return on_turned(fit, found.taken_off(fit.test), monitor=monitor), found
+    except (Stop, KeyboardInterrupt):
+        return replace(fit, stopped=True), stated
+
+
+def of_calibrated_lines(modal: ModalEstimate, calibration: Calibration) -> ModalEstimate:
+    """The estimate of lines from which nothing was taken off yet, without these errors of their gains."""
+    turned = ModalEstimate.of_lines(calibration.taken_off(modal.records))
+    return replace(turned, delays=modal.delays, calibration=calibration)
 
 
 def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:

@@ -156,7 +156,7 @@ class Parameters:
     coupling : (m, m) or None
         rad/s, off the diagonal of ``Phi' C Phi``, of modes that dampers couple; None where damping is classical.
     gains : (k,)
-        Errors of gains within tolerances, in these: see `tolerances_at_sensors`; empty where all are zero.
+        Errors of gains within their tolerances, in units of these; empty where none are stated.
     """
 
     modes: Modes
@@ -198,7 +198,7 @@ class SpectralModel:
         self.moving: dict[int, int] = {}
         self.n_ends = 0
         self.gains = False
-        self.by_gains: Array = np.zeros((self.n, 0))
+        self.by_gains: Array = np.zeros((self.channels, self.d, 0))
 
     @property
     def numbers(self) -> int:
@@ -246,10 +246,12 @@ class Lines:
         modes = p.modes
         self.g = gains(freq, modes.omega, modes.ratios)
         self.shapes = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
-        rigid = model.test.rigid_body
+        self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
+        self.reads = np.ones(self.direct.shape)  # what gains make of the channels' parts, (c, d)
         if p.gains.size:
-            rigid = rigid * (1 + model.by_gains @ p.gains)[:, None]
-        self.direct = rigid if not model.force else np.vstack([rigid, p.rigid])
+            self.reads = 1 + model.by_gains @ p.gains
+            self.direct = self.reads * self.direct
+            self.shapes = np.vstack([modes.phi, self.reads[model.n :, :1] * self.shapes[model.n :]])
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
         self.transients = np.zeros((0, run.w.size), complex) if at is None else model.transients(freq)

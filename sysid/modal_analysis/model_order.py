@@ -82,9 +82,19 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
     if added == 0 or more.likelihood - fit.likelihood < _PROMISING * added * least or np.any(no_modes(more)):
         return None
     more = refitted(more, more.parameters, limits=TRIAL, some=some, monitor=monitor)
-    if not more.settled or more.likelihood - fit.likelihood < added * least:
-        return None
-    return None if np.any(no_modes(more)) or np.min(worth(more)) < least else more
+    while more.settled and more.likelihood - fit.likelihood >= max(added, 1) * least and not np.any(no_modes(more)):
+        each = worth(more)
+        if np.min(each) >= least:
+            return more
+        # What one of two close together is worth shows without it only, when the other has moved.
+        poorest = np.arange(each.size) == np.argmin(each)
+        fewer = refitted(more, without(more, poorest), limits=TRIAL, some=some, monitor=monitor)
+        if more.likelihood - fewer.likelihood >= least:
+            return more
+        if added == 0:
+            break
+        more, added = fewer, added - 1
+    return None
 
 
 def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> RecordFit:

@@ -201,7 +201,7 @@ class RecordFit:
         shapes: list[tuple[int, ...]] = [
             (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
             (test.n_runs, c, trace_count(test)), (len(model.runs), c + model.d),
-            (model.by_gains.shape[1],),
+            (model.by_gains.shape[2],),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))

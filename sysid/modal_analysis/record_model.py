@@ -12,7 +12,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.measurement.gains import tolerances_at_sensors
+from sysid.measurement.gains import read_by_gains
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
@@ -48,8 +48,7 @@ class RecordModel(SpectralModel):
     The last `static` modes share a pole that is held, and do not move at the ends of runs. Where the others are
     `coupled` by dampers, entries of ``Phi' C Phi`` off the diagonal are the last unknowns before those of gains: each
     once, or, without a force, where modes have no scale of their own, on both sides of the diagonal. Where gains have
-    tolerances, errors in units of these stand there too, with a chi-squared of their own: ``G u`` of each sensor takes
-    its factor, so that nothing else makes up for it.
+    tolerances, errors in units of these stand there too, with a chi-squared of their own: see `read_by_gains`.
 
     Attributes
     ----------
@@ -77,7 +76,7 @@ class RecordModel(SpectralModel):
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self.by_gains: Array = tolerances_at_sensors(test)
+        self.by_gains = read_by_gains(test)
         self.pulses, reached = self.whole.pulses(test.freq[-1])
         self._place(static, trace_count(test), gains=gains, coupled=coupled)
         if self.pulses.size:  # a run that begins and ends at rest has none
@@ -93,7 +92,7 @@ class RecordModel(SpectralModel):
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
         self.coupling = slice(before, before + len(self.coupled))
-        self.of_gains = slice(self.coupling.stop, self.coupling.stop + self.by_gains.shape[1])
+        self.of_gains = slice(self.coupling.stop, self.coupling.stop + self.by_gains.shape[2])
         self.n_fit = self.of_gains.stop
         self.gains = gains
         self.delays = self.n_fit + 3 * self.n * self.d  # where they begin
@@ -141,7 +140,7 @@ class RecordModel(SpectralModel):
         theta = np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios)])
         rigid = np.array([p.rigid[i, j] for i, j in index.pairs]) if self.force else np.zeros(0)
         coupling = np.zeros(len(self.coupled)) if p.coupling is None else p.coupling[*self.coupled.T]
-        of_gains = p.gains if p.gains.size else np.zeros(self.by_gains.shape[1])
+        of_gains = p.gains if p.gains.size else np.zeros(self.by_gains.shape[2])
         return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling, of_gains])
 
     def unpack(self, x: Array) -> Parameters:
@@ -182,7 +181,7 @@ class RecordModel(SpectralModel):
     def unknowns(self) -> int:
         """Numbers that the records determine: not those within tolerances, nor, without a force, scales of modes."""
         turns = self.static * (self.static - 1) // (2 if self.force else 1)
-        return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns - self.by_gains.shape[1]
+        return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns - self.by_gains.shape[2]
 
     def scales(self, p: Parameters) -> Array:
         """Moves of all unknowns that change nothing, (k, size): without a force, shape against load of each mode."""
@@ -324,16 +323,26 @@ class Chunk(Lines):
         return np.concatenate([plain, by[moved] * plain[moving]])
 
     def of_motion(self, channel: int, base: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
-        """Entries of what multiplies the motions of the modes, and that of the base, whose spectra begin at `base`."""
+        """Entries of what multiplies the motions of the modes, and that of the base, whose spectra begin at `base`.
+
+        Gains within tolerances included.
+        """
         model, k, one = self.records, np.arange(self.records.m), np.ones(1)
         n, d, index = model.n, model.d, model.index
+        gains = np.arange(model.of_gains.start, model.of_gains.stop)
+        by_gains, shapes = model.by_gains[channel], self.shapes[channel] / self.reads[channel, 0]
+        for j, direct in enumerate(self.direct[channel] / self.reads[channel]):
+            yield gains, np.full(gains.size, base + j), direct * by_gains[j]
+        for mode in k if channel >= n and gains.size else ():
+            yield gains, np.full(gains.size, mode), shapes[mode] * by_gains[0]
         if channel < n:
             yield index.phi.start + channel * model.m + k, k, np.ones(model.m)
             return
-        yield index.gamma.start + k * d + channel - n, k, np.ones(model.m)
+        reads = self.reads[channel, 0]
+        yield index.gamma.start + k * d + channel - n, k, np.full(model.m, reads)
         for at, (a, b) in enumerate(index.pairs):
             if channel - n in (a, b):
-                yield index.rigid[[at]], np.array([base + (b if channel - n == a else a)]), one
+                yield index.rigid[[at]], np.array([base + (b if channel - n == a else a)]), reads * one
 
     def of_sensor(
         self, channel: int, base: int, last: int
@@ -346,11 +355,6 @@ class Chunk(Lines):
         if model.gains:
             late = last + traces.size + 2 * d + channel
             yield np.array([model.delays + min(channel, n)]), np.array([late]), np.ones(1)
-        if channel < n and model.by_gains.size:
-            of_gains = np.arange(model.of_gains.start, model.of_gains.stop)
-            for j in range(d):
-                share = model.by_gains[channel] * model.test.rigid_body[channel, j]
-                yield of_gains, np.full(of_gains.size, base + j), share
         if model.gains and channel < n:
             yield model.n_fit + channel * d + beside, base + beside, np.ones(d)
             for kind in (1, 2):

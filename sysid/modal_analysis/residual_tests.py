@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
@@ -315,10 +316,37 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     fitted = half_inverse(normal[:at, :at], ROUND_OFF) / size[:at, None]
     half = np.zeros((fit.model.size, fitted.shape[1]))
     half[asked[:at]] = fitted
-    moves, found = _moves_by_gains(fit, half), fit.model.by_gains @ fit.parameters.gains
     return Gains(
-        found + np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
+        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, _moves_by_gains(fit, half),
+        rigid, chi2,
     )  # fmt: skip
+
+
+def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:
+    """Errors of gains by a step of all unknowns from the end of a fit, beside their tolerances, and what is left.
+
+    What modes above the lines make is asked for too. What the model misses beyond the noise counts as noise of the
+    records, beside which tolerances weigh more.
+    """
+    model, n, d = fit.model, fit.model.n, fit.model.d
+    own, above = np.r_[model.of_gains], np.arange(model.n_fit + n * d, fit.asked.delays)
+    others = np.setdiff1d(np.concatenate([np.flatnonzero(~model.held), above]), own)
+    equations = fit.equations.at(np.concatenate([others, own]))
+    normal, size = unit_diagonal(equations.normal)
+    gradient, at = equations.gradient / size, others.size
+    half = half_inverse(normal[:at, :at], ROUND_OFF)
+    across = half.T @ normal[:at, at:]
+    seen = (normal[at:, at:] - across.T @ across) * np.outer(size[at:], size[at:])  # tolerances included
+    step = np.linalg.solve(seen, size[at:] * (gradient[at:] - across.T @ (half.T @ gradient[:at])))
+    of_records, found = seen - np.eye(own.size) / 2, fit.parameters.gains + step
+    weight = 2 / max(fit.reduced, 1.0)
+    covariance = np.linalg.inv(weight * of_records + np.eye(own.size))
+    told = np.flatnonzero(stated.tolerance)[: own.size]
+    values, left = np.zeros(stated.values.size), np.diag(stated.tolerance**2)
+    scale = stated.tolerance[told]
+    values[told] = scale * (covariance @ (weight * (of_records @ found + found / 2)))
+    left[np.ix_(told, told)] = scale[:, None] * covariance * scale
+    return replace(stated, values=values, covariance=left)
 
 
 def _asked_of_gains(fit: RecordFit) -> NDArray[np.intp]:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sysid.assessment.checks.gains import gain_errors
 from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
-from sysid.modal_analysis.fit import calibrated
+from sysid.modal_analysis.fit import of_calibrated_lines
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
@@ -138,19 +138,23 @@ _GAINS = "gains within tolerances"  # the phase of the fit without their errors
 def within_tolerances(
     problem: Prepared, end: Outcome, strategy: Strategy, session: Session
 ) -> tuple[Prepared, Outcome]:
-    """The problem and where its search ended, without the errors of gains that records and tolerances make likely."""
-    stated = problem.stated
-    if end.stopped is not None or problem.stopped or not any(one.calibration for one in problem.modal):
+    """The problem and where its search ended, without the errors of gains that spectra and tolerances make likely.
+
+    Those of whole records were taken off with the fit of their modes.
+    """
+    modal, fits = list(problem.modal), problem.screened.fits(end.structure, end.x)
+    asked = [
+        (at, one.calibration, gain_errors(one, its))
+        for at, (one, its) in enumerate(fits, start=problem.first_test - 1)
+        if one.calibration is not None and not one.of_records
+    ]
+    if end.stopped is not None or not asked:
         return problem, end
-    modal = list(problem.modal)
+    for at, stated, found in asked:
+        likely = stated.given(modal[at].records, found.error, found.std)
+        modal[at] = of_calibrated_lines(modal[at], likely)
     try:
-        with session.fit_monitor() as monitor:
-            for at, (one, its) in enumerate(problem.screened.fits(end.structure, end.x), start=problem.first_test - 1):
-                if one.calibration is not None:
-                    found = gain_errors(one, its)
-                    likely = one.calibration.given(one.records, found.error, found.std)
-                    modal[at] = calibrated(modal[at], likely, monitor)
-        other = Prepared(stated, modal, in_squares=problem.in_squares)
+        other = Prepared(problem.stated, modal, in_squares=problem.in_squares)
         again = _fitted(other.screened, end, strategy, session)
     except (Stop, KeyboardInterrupt) as stop:
         return problem, _cut_short(end, str(stop) or "interrupted", stop)

@@ -73,14 +73,16 @@ class GainErrors:
     def of_base(self, driven: NDArray[np.bool_] | None = None) -> float | None:
         """The one error that explains those of all sensors, or of those `driven` by a base direction, (n_sensors,).
 
-        Where three or more show one, and one of them is wrong by it: then it is the base's.
+        Where three or more show one, beyond chance and tolerances: then it is the base's.
         """
         known = np.isfinite(self.error) & (True if driven is None else driven)
         if np.count_nonzero(known) < 3 or not np.any(known[self.wrong]):
             return None
         error, std = self.error[known], np.hypot(self.std, self.tolerance)[known]
-        one = float(np.average(error, weights=std**-2))
-        return one if np.all(np.abs(error - one) < most_deviations(error.size) * std) else None
+        one, chance = float(np.average(error, weights=std**-2)), float(np.sum(std**-2.0) ** -0.5)
+        likely = most_deviations(error.size)
+        alike = np.all(np.abs(error - one) < likely * std)
+        return one if alike and abs(one) > likely * np.hypot(chance, self.tolerance[known].min()) else None
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -96,7 +98,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     if calibration is None:
         return found
     H = seen_at_sensors(modal.records)
-    taken, tolerance = H @ calibration.values, np.sqrt(H**2 @ tolerance_of(modal.records) ** 2)
+    taken, tolerance = H @ calibration.values, np.sqrt(H**2 @ calibration.tolerance**2)
     return replace(
         found, error=found.error + taken, tolerance=tolerance, possible=np.where(tolerance > 0, 0.0, found.possible)
     )
@@ -246,7 +248,7 @@ def assumed(problem: Prepared) -> Iterator[Finding]:
     test, mass = problem.measurement, problem.formulation.mass
     if mass.entries is not None and np.all(np.isfinite(mass.entries)):
         return
-    moved, tolerance = np.any(test.rigid_body, axis=1), tolerance_of(test)
+    moved, tolerance = np.any(test.rigid_body, axis=1), tolerance_of(problem.stated.measurement)
     still = [test.sensor_names[i] for i in np.flatnonzero(~moved & (tolerance[: moved.size] == 0))]
     for name in still:
         yield Finding(
