@@ -197,6 +197,11 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
         "--goal", type=float, metavar="SHARE",
         help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
     )  # fmt: skip
+    run.add_argument(
+        "--gain-std", type=float, metavar="SHARE",
+        help="of TEST.h5: tolerance of the gains of all channels, base and force included, as a standard deviation, "
+        "such as 0.005; those that the sensors' list states, exact where it states none",
+    )  # fmt: skip
 
 
 def _add_modal_options(command: argparse.ArgumentParser) -> None:

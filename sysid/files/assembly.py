@@ -55,7 +55,10 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
             f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
         )
     remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0]))]
-    return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks))
+    return RecordedTest(
+        tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks),
+        **tolerances_of(said, axes),
+    )  # fmt: skip
 
 
 def delays_in_words(said: Description) -> list[str]:
@@ -114,7 +117,23 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
     """The sensors of the responses, each once."""
     found = {channel.name: channel for channel in said.channels if channel.role == "response"}
     points = {name: channel.position or (0.0, 0.0, 0.0) for name, channel in found.items()}
-    return tuple(Sensor(name, points[name], channel.axis) for name, channel in found.items())
+    return tuple(
+        Sensor(name, points[name], channel.axis, gain_std=channel.gain_std) for name, channel in found.items()
+    )
+
+
+def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Array | None]:
+    """Tolerances of the gains of base and force in each direction, (d,), by their names in `RecordedTest`.
+
+    Several sensors of the base, each independent of the others, share theirs; of load cells the largest is that of all.
+    """
+    base = [(channel, channel.gain_std) for channel in said.channels if channel.role == "base"]
+    force = [channel.gain_std for channel in said.channels if channel.role == "force"]
+    share = np.linalg.pinv(_motions(base, said, axes)) if any(std for _, std in base) else None
+    return {
+        "base_gain_std": None if share is None else np.sqrt(share**2 @ np.array([std**2 for _, std in base])),
+        "force_gain_std": np.full(len(axes), max(force)) if any(force) else None,
+    }
 
 
 def base_directions(said: Description, channels_needed: bool = True) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from sysid.errors import InputError, as_float, choice, flag, path_of, printable,
 from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
-_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "delay", "reference")
+_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "gain_std", "delay", "reference")
 _TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join", "align")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
@@ -34,7 +34,7 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """Description of one column, which is divided by `gain` and earlier by `delay`, s.
+    """Description of one column, which is divided by `gain`, known to `gain_std`, and earlier by `delay`, s.
 
     `axis`, `position` are None where the file tells them.
     """
@@ -48,6 +48,7 @@ class Channel:
     reference: str
     gain: float
     delay: float = 0.0
+    gain_std: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,12 +106,12 @@ def from_words(words: Sequence[str]) -> dict[str, Any]:
         known = " ".join(f"{one}=" for one in _FIELDS[1:])
         wrong = not equals or name not in _FIELDS[1:]
         refuse((wrong, f"--sensor {words[0]}: {word!r} is none of {known}; such as role=response position=0,0,3"))
-        alone, listed = name in ("gain", "delay"), name == "position" or (name == "axis" and "," in value)
+        alone, listed = name in ("gain", "gain_std", "delay"), name == "position" or (name == "axis" and "," in value)
         try:
             entry[name] = float(value) if alone else [float(one) for one in value.split(",")] if listed else value
         except ValueError:
-            examples = {"gain": "a number, such as gain=0.995", "delay": "a number, such as delay=0.002"}
-            such = examples.get(name, f"numbers, such as {name}=0,0,3")
+            examples = {"gain": 0.995, "gain_std": 0.005, "delay": 0.002}
+            such = f"a number, such as {name}={examples[name]}" if alone else f"numbers, such as {name}=0,0,3"
             raise InputError(f"--sensor {words[0]}: {word!r} needs {such}") from None
     return entry
 
@@ -168,9 +169,10 @@ def _channel(entry: Any, place: str) -> Channel:
     name = text(f"{place}: name", entry.get("name", str(column)))
     unit, reference = (printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference"))
     gain = as_float(f"{place}: gain", entry.get("gain", 1.0), "a positive number, such as 0.995,", above=0)
+    gain_std = as_float(f"{place}: gain_std", entry.get("gain_std", 0.0), "a fraction, such as 0.005,", at_least=0)
     delay = as_float(f"{place}: delay", entry.get("delay", 0.0), "a number of seconds, such as 0.002,")
     at = None if where is None else (x, y, z)
-    return Channel(column, entry["role"], axis, name, at, unit, reference, gain, delay)
+    return Channel(column, entry["role"], axis, name, at, unit, reference, gain, delay, gain_std)
 
 
 def description_file(path: Path) -> Path | None:

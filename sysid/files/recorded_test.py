@@ -5,7 +5,7 @@ Records in time stay records, so that whoever identifies from them chooses the e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,8 @@ class RecordedTest:
         Of all channels, file by file.
     remarks : tuple of str
         What was left out, recognised or mended.
+    base_gain_std, force_gain_std : (d,) or None
+        Tolerances of gains: see `Measurement`; sensors state theirs.
     """
 
     runs: tuple[Run, ...]
@@ -67,6 +69,8 @@ class RecordedTest:
     freq: Array | None
     table: tuple[ChannelRow, ...]
     remarks: tuple[str, ...] = ()
+    base_gain_std: Array | None = None
+    force_gain_std: Array | None = None
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
@@ -80,17 +84,18 @@ class RecordedTest:
         """
         G = rigid_body(sensors=self.sensors, base_axes=self.base_axes, origin=self.origin)
         given: Any = {"rigid_body": G, "sensors": self.sensors, "base_axes": self.base_axes}
+        tolerances: Any = {"base_gain_std": self.base_gain_std, "force_gain_std": self.force_gain_std}
         if self.freq is None:
             assert self.sample_rate is not None
             if options.get("estimator", "records") == "records" and options.get("band") is None:
                 options["band"] = self.excited_band
-            return Measurement.from_time(self.runs, self.sample_rate, **given, **options)
+            return replace(Measurement.from_time(self.runs, self.sample_rate, **given, **options), **tolerances)
         band = options.pop("band", None)
         if options:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
         parts: Any = zip(*self.runs, strict=True)
         base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
-        test = Measurement(self.freq, base, response, force=force, **given)  # type: ignore[arg-type]
+        test = Measurement(self.freq, base, response, force=force, **given, **tolerances)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
     def in_words(self) -> str:
@@ -126,6 +131,8 @@ class RecordedTest:
                 "freq": self.freq,
                 "table": [vars(row) for row in self.table],
                 "remarks": list(self.remarks),
+                "base_gain_std": self.base_gain_std,
+                "force_gain_std": self.force_gain_std,
             },
             _FORMAT,
         )
@@ -138,7 +145,8 @@ class RecordedTest:
         test = cls(
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
-            tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]),
+            tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
+            tree.get("force_gain_std"),
         )  # fmt: skip
         test._check()
         return test

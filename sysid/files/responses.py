@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
-from sysid.files.assembly import base_directions, delays_in_words, described, row_of, run_of, sensors_of, work_of_force
+from sysid.files.assembly import base_directions, delays_in_words, described, row_of, run_of, sensors_of, tolerances_of, work_of_force
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column
@@ -61,7 +61,10 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
     freq, runs = freq[kept], [_at(run, kept) for run in runs]
     remarks += ["the line at 0 Hz is left out"] * (not np.all(kept))
     remarks += [*delays_in_words(said), *work_of_force(runs, freq), how]
-    return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks))
+    return RecordedTest(
+        tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks),
+        **tolerances_of(said, axes),
+    )  # fmt: skip
 
 
 def _runs(

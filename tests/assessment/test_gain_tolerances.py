@@ -1,0 +1,188 @@
+"""Gains within stated tolerances: what is taken off, what intervals hold, and who is named beyond them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import Problem, Sensor, Structure, simulate
+from sysid.assessment.uncertainty import moves_by_records
+from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
+from sysid.modal_analysis.calibration import Calibration
+from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.residual_tests import calibration_of
+
+ERROR = 0.02
+TOLERANCES = {"gain_std": 0.005, "base_gain_std": 0.004, "force_gain_std": 0.003}
+
+
+def misread(test, errors):
+    """The test as channels with these errors of their gains record it."""
+    return dataclasses.replace(without_gains(test, 1 / (1 + errors) - 1), gain_std=None, base_gain_std=None,
+                               force_gain_std=None)  # fmt: skip
+
+
+def frame(sensors=None):
+    """Four storeys on a base of 2 kg, and modes some widths apart."""
+    K = 5000.0 * np.array([[2.0, -1, 0, 0, -1], [-1, 2, -1, 0, 0], [0, -1, 2, -1, 0], [0, 0, -1, 1, 0],
+                           [-1, 0, 0, 0, 1]])  # fmt: skip
+    return Structure(np.diag([4.0, 3.0, 5.0, 2.0, 2.0]), K, [0.01, 0.015, 0.02, 0.015], n_base=1, sensors=sensors)
+
+
+@pytest.fixture(scope="module")
+def spectra():
+    f = frame().natural_frequencies
+    return simulate(frame(), np.geomspace(0.3 * f[0], 1.4 * f[-1], 300), noise=0.003, force=True, rng=3)
+
+
+@pytest.fixture(scope="module")
+def records(spectra):
+    """Two runs of the frame under sums of cosines that are no lines of the records."""
+    rng, rate, truth = np.random.default_rng(0), 40.0, frame()
+    freq = np.linspace(0.9, 14.0, 173)
+    H = np.concatenate([np.ones((1, freq.size)), truth.transmissibility(freq)[:, 0], truth.base_force(freq)[0]])
+    runs = []
+    for _ in range(2):
+        waves = rng.normal(size=freq.size) + 1j * rng.normal(size=freq.size)
+        clean = ((H * waves) @ np.exp(2j * np.pi * np.outer(freq, np.arange(2400) / rate))).real
+        noisy = clean + 0.01 * np.std(clean, axis=1)[:, None] * rng.normal(size=clean.shape)
+        runs.append((noisy[:1], noisy[1:-1], noisy[-1:]))
+    return sysid.Measurement.from_time(runs, rate, rigid_body=truth.rigid_body, band=(0.9, 14.0))
+
+
+@pytest.mark.parametrize("gain", [1, 4, 5], ids=["a sensor", "the base", "the force"])
+@pytest.mark.parametrize("kind", ["spectra", "records"])
+def test_moves_are_those_of_refits(spectra, records, kind, gain):
+    test = {"spectra": spectra, "records": records}[kind]
+    result, step = sysid.identify(Problem(test), rng=0), 1e-3
+    modes, index, *_, shifts, _ = moves_by_records(result.prepared, result.structure, gains=True)
+    ends = [sysid.identify(Problem(misread(test, sign * step * np.eye(6)[gain])), rng=0).structure for sign in (1, -1)]
+    phi, gamma, _, _, rigid = index.split(shifts[:, [gain]])
+    signs = [np.sign(np.sum(one.participation * modes.gamma, axis=1)) for one in ends]
+    for moved, parts in (
+        (phi[..., 0], [one.mode_shapes * sign for one, sign in zip(ends, signs, strict=True)]),
+        (gamma[..., 0], [one.participation * sign[:, None] for one, sign in zip(ends, signs, strict=True)]),
+        (rigid[..., 0], [one.rigid_body_mass for one in ends]),
+    ):
+        change = (parts[0] - parts[1]) / (2 * step)
+        np.testing.assert_allclose(moved, change, rtol=0.02, atol=0.01 * np.abs(change).max() + 1e-3)
+
+
+def test_slopes_of_the_model_of_records_by_gains(records):
+    """Central differences of fourth order of its sum of squares."""
+    test, rng = dataclasses.replace(records, **TOLERANCES), np.random.default_rng(1)
+    fit = whole_fit(records)
+    model = RecordModel(test, fit.model.m)
+    x = model.pack(dataclasses.replace(fit.parameters, gains=rng.normal(size=6)))
+    slopes = model.normal_equations(model.unpack(x), fit.levels).gradient
+    for at in [*range(model.of_gains.start, model.of_gains.stop), int(model.index.rigid[0]), model.index.gamma.start]:
+        step = 1e-4 * max(abs(x[at]), 0.1) * np.eye(x.size)[at]
+        values = [model.chi2(model.unpack(x + times * step), fit.levels) for times in (-2, -1, 1, 2)]
+        slope = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step[at])
+        assert slope == pytest.approx(-2 * slopes[at], rel=1e-5, abs=1e-6 * np.abs(slopes).max())
+
+
+def test_likeliest_errors_of_gains_are_those_of_least_squares(spectra):
+    test = dataclasses.replace(spectra, **TOLERANCES)
+    stated, rng = Calibration.stated(test), np.random.default_rng(2)
+    error, std = 0.003 * rng.normal(size=4), np.array([0.001, 0.004, 0.02, 0.001])
+    found = stated.given(test, np.where(np.arange(4) == 2, np.nan, error), std)
+    known = np.arange(4) != 2
+    rows = np.vstack([seen_at_sensors(test)[known] / std[known, None], np.diag(1 / stated.tolerance)])
+    wanted = np.concatenate([error[known] / std[known], np.zeros(6)])
+    np.testing.assert_allclose(found.values, np.linalg.lstsq(rows, wanted)[0], atol=1e-12)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(rows.T @ rows), atol=1e-14)
+
+
+def test_records_show_gains_as_closely_as_the_estimate_beside_exact_ones(records):
+    """Where tolerances are wide they tell next to nothing, and the base exact: what is found is what the records show."""
+    errors = np.array([0.012, -0.02, 0.007, 0.0, 0.0, 0.0])
+    given = dataclasses.replace(misread(records, errors), gain_std=0.25)
+    fit = whole_fit(given)
+    found = calibration_of(fit, Calibration.stated(given))
+    std = np.sqrt(np.diag(found.covariance))[:4]
+    assert np.all(np.abs(found.values - errors)[:4] < 4 * std) and np.all(std < 0.004) and np.all(std > 1e-4)
+
+
+@pytest.mark.parametrize("kind", ["spectra", "records"])
+def test_intervals_hold_tolerances_and_nobody_is_accused(spectra, records, kind):
+    test = {"spectra": spectra, "records": records}[kind]
+    errors = np.array([0.006, -0.004, 0.003, -0.007, 0.004, -0.003])
+    plain = sysid.identify(Problem(test), rng=0)
+    result = sysid.identify(Problem(dataclasses.replace(misread(test, errors), **TOLERANCES)), rng=0)
+    assert result.determined and "gain" not in [one.kind for one in result.findings]
+    truth = frame()
+    for name, exact in (("mass", truth.mass[:4, :4]), ("stiffness", truth.stiffness[:4, :4])):
+        std = getattr(result.uncertainty, name)
+        assert np.all(np.abs(getattr(result.structure, name)[:4, :4] - exact) < 4 * std)
+        # Of the force no record shows the gain, and M, K and C are in proportion to it.
+        least = np.hypot(np.diag(getattr(plain.uncertainty, name)), 0.003 * np.diag(exact))
+        assert np.all(np.diag(std) > 0.98 * least)
+    taken = result.modal[0].calibration
+    sensors = seen_at_sensors(test) @ taken.values
+    np.testing.assert_allclose(sensors, seen_at_sensors(test) @ errors, atol=0.003)
+
+
+def test_gains_beyond_tolerances_are_named(spectra):
+    errors = np.array([0.003, 0.05, -0.004, 0.002, 0.003, 0.0])
+    result = sysid.identify(Problem(dataclasses.replace(misread(spectra, errors), **TOLERANCES)), rng=0)
+    (told,) = [one for one in result.findings if one.kind == "gain"]
+    assert told.channel == "sensor 2" and told.numbers["gain"] == pytest.approx(1.05, abs=0.01)
+
+
+def test_one_error_of_all_sensors_is_the_bases(spectra):
+    result = sysid.identify(Problem(misread(spectra, ERROR * np.eye(6)[4])), rng=0)
+    (told,) = [one for one in result.findings if one.kind == "gain"]
+    assert told.channel == "base x" and told.numbers["gain"] == pytest.approx(1 + ERROR, abs=2e-3)
+
+
+def test_a_table_that_rocks_is_told():
+    """Sensors at heights of 1 to 4 m move by 0.02 rad/m times these beside what the base's record says."""
+    sensors = [Sensor(f"floor {i}", (0.0, 0.0, float(i)), "x") for i in range(1, 5)]
+    truth, rocking = frame(sensors), 0.02
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.3 * f[0], 1.4 * f[-1], 300), noise=0.001, rng=4, base_axes="x")
+    moved = test.response + rocking * np.arange(1, 5)[:, None] * test.base
+    found = sysid.identify(Problem(dataclasses.replace(test, response=moved)), rng=0).findings
+    (told,) = [one for one in found if one.kind == "table rocks"]
+    assert told.numbers["slope"] == pytest.approx(rocking, abs=4 * told.numbers["std"]) and told.numbers["std"] < 0.002
+    assert not [one for one in found if one.kind == "gain"]
+
+
+def test_a_result_with_tolerances_is_stored_to_the_bit(records, tmp_path):
+    given = dataclasses.replace(misread(records, 0.004 * np.ones(6)), **TOLERANCES)
+    result = sysid.identify(Problem(given), rng=0)
+    result.save(tmp_path / "result.h5")
+    again = sysid.load(tmp_path / "result.h5")
+    for one, other in zip(vars(result.modal[0].calibration).values(), vars(again.modal[0].calibration).values(),
+                          strict=True):  # fmt: skip
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(result.uncertainty.mass, again.uncertainty.mass)
+    assert again.measurement.response.tobytes() == result.measurement.response.tobytes()
+
+
+def test_functions_for_unit_motion_stay_so(spectra):
+    errors = 0.01 * np.arange(1, 7)
+    assert without_gains(spectra, errors).has_unit_runs
+    moved = dataclasses.replace(spectra, base=spectra.base * (1 + 1e-9j))  # no unit runs any more
+    plain, unit = without_gains(moved, errors), without_gains(spectra, errors)
+    np.testing.assert_allclose(unit.response, plain.response / (plain.base / moved.base), rtol=1e-8)
+    np.testing.assert_allclose(unit.force, plain.force / (plain.base / moved.base), rtol=1e-8)
+
+
+def test_what_gains_make_of_channels(records):
+    """Against records divided by one and small errors, of a model whose participations take up the base's."""
+    test = dataclasses.replace(records, **TOLERANCES)
+    moves = read_by_gains(test)
+    assert moves.shape == (5, 1, 6)
+    np.testing.assert_allclose(moves[1, 0], [0, 0.005, 0, 0, -0.004, 0])
+    np.testing.assert_allclose(moves[4, 0], [0, 0, 0, 0, 0.004, 0.003])
+    assert read_by_gains(dataclasses.replace(test, force=None)).shape == (4, 1, 5)
+
+
+@pytest.mark.parametrize("std", [-0.1, 0.5, np.nan, [0.1, 0.1]])
+def test_what_is_no_tolerance_is_refused(spectra, std):
+    with pytest.raises(sysid.InputError, match="gain_std"):
+        dataclasses.replace(spectra, gain_std=std)
