@@ -58,7 +58,8 @@ def clock_moves(units: Sequence[UnitColumns], said: Description) -> tuple[Array,
         lag, reach = _refined(pair, last)
         move = reference.begin - lag / rate - unit.begin
         found.append(move if abs(move) * rate > reach else 0.0)
-        remarks.append(f"{unit.name} is moved by {found[-1]:+.4g} s to the clock of {reference.name}")
+        by = f"is moved by {found[-1]:+.4g} s to" if found[-1] else "is already on"
+        remarks.append(f"{unit.name} {by} the clock of {reference.name}")
     words = "these moves are coarse: what is left is found with the modes (late sensor)"
     return np.insert(np.array(found), first, 0.0), [*remarks, words]
 
