@@ -135,8 +135,8 @@ def _refined(pair: _Pair, last: float, fewest: int = 10) -> tuple[int, float]:
     line, moved = np.arange(X.size), np.abs(Y) ** 2
     power = np.abs(np.fft.rfft(pair.base * np.hanning(pair.base.size), n)) ** 2  # without leakage of what was cut off
     slow = (line < last * n) & (power > _least(power))
-    low = np.quantile(line[slow], 0.1) if np.any(slow) else 0.0
-    if np.count_nonzero(slow) < fewest or 2 * low > last * n:  # of less than an octave one period passes for another
+    # Of less than an octave one period passes for another.
+    if np.count_nonzero(slow) < fewest or 2 * np.quantile(line[slow], 0.1) > last * n:
         return pair.lag, float(2 * n * moved.sum() / np.sum(line * moved))
     shared = np.abs(np.fft.irfft(np.where(slow, Y * X.conj(), 0.0), n))
     near = pair.lag + np.arange(-int(1 / last), int(1 / last) + 1)
