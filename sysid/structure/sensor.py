@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,7 @@ class Sensor:
     name: str
     position: tuple[float, float, float]
     axis: str | tuple[float, float, float]
-    delay: float = field(default=0.0, kw_only=True)
+    delay: float = 0.0
 
     def __post_init__(self) -> None:
         label = f"sensor {text('the name of a Sensor', self.name)!r}"
