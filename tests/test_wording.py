@@ -345,11 +345,19 @@ def test_a_mistake_on_the_command_line_is_one_line(here, capsys, command):
     assert capsys.readouterr() == ("", f"sysid: {COMMANDS[command]}\n")
 
 
+def late(*delays):
+    """The test with noise of 1 %, its sensors late by so many seconds."""
+    test = sysid.simulate(TRUTH, LINES, noise=0.01, rng=0)
+    return replace(test, response=test.response * np.exp(-2j * np.pi * LINES * np.array(delays)[:, None]))
+
+
 ALIKE = "other mass and stiffness matrices answer identically"
 UNIT = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
 CASES = {
     "gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [1.02]])),
     "low gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [0.9956]])),
+    "late": lambda: identified(late(0.0, 0.012)),
+    "late base": lambda: identified(late(-0.012, -0.012)),
     "goal": lambda: identified(sysid.simulate(TRUTH, LINES, noise=0.01, rng=0), goal=1e-4),
     "force": lambda: identified(FORCED),
     "nothing": lambda: identified(TEST),
@@ -377,6 +385,20 @@ FOUND = [
         lambda of: f"sensor 2 reads 0.44 % low against the base (standard deviation {100 * of['std']:.1g} %): M_SS, "
         "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956 (gain = 0.9956 in "
         "sensors.toml), or correct its axis or its row of rigid_body",
+    ),
+    (
+        "late", "late sensor",
+        lambda of: f"sensor 2 is recorded {1e3 * of['delay']:.4g} ms late against the base (standard deviation "
+        f"{1e3 * of['std']:.1g} ms), as by a clock or a filter of its own; that is taken off before anything else is "
+        f"judged; state it where the channel is described: delay = {of['delay']:.6f}".rstrip("0") + ", or bring the "
+        "records to one clock (sysid.resample), or filter all channels alike",
+    ),
+    (
+        "late base", "late sensor",
+        lambda of: f"the base is recorded {-1e3 * of['delay']:.4g} ms late against all other channels (standard "
+        f"deviation {1e3 * of['std']:.1g} ms), as by a clock or a filter of its own; that is taken off before anything "
+        f"else is judged; state it where the channel is described: delay = {-of['delay']:.6f}".rstrip("0") + ", or "
+        "bring the records to one clock (sysid.resample), or filter all channels alike",
     ),
     ("goal", "goal", lambda of: f"the residual {of['residual']:.3g} is above the goal 0.0001"),
     (

@@ -48,12 +48,11 @@ class Content:
     @classmethod
     def of(cls, it: Identification, positive_axes: bool = False) -> Content:
         """The content of a result, all its sensors along +x, +y, +z, +rx, ... where `positive_axes`."""
-        sensors = it.measurement.sensors
         if not positive_axes:
-            return cls(it, it.structure, sensors)
+            return cls(it, it.structure, it.measurement.sensors)
+        sensors = it.measurement.sensors or ()
         undescribed = "the axes of the sensors are not known: describe them (sensors=[sysid.Sensor(...)])"
-        refuse((sensors is None, f"positive axes: {undescribed}"))
-        sensors = sensors or ()
+        refuse((not sensors, f"positive axes: {undescribed}"))
         signs = np.array([-1.0 if _negative(sensor) else 1.0 for sensor in sensors])
         described = zip(sensors, signs, strict=True)
         turned = tuple(replace(one, axis=_positive(one)) if sign < 0 else one for one, sign in described)
@@ -75,8 +74,8 @@ class Content:
     def names(self) -> tuple[str, ...]:
         """Names of the rows of the matrices: the structure's degrees of freedom, then "base x" and so on."""
         called = list(self.it.degrees_of_freedom)
-        for row, sensor in enumerate(self.structure.dof_sensors):
-            called[row] = self.sensor_names[sensor] if sensor >= 0 else called[row]
+        for row in np.flatnonzero(self.structure.dof_sensors >= 0):
+            called[row] = self.sensor_names[self.structure.dof_sensors[row]]
         return (*called, *(f"base {axis}" for axis in self.base_axes))
 
     @cached_property

@@ -58,7 +58,8 @@ def clock_moves(units: Sequence[UnitColumns], said: Description) -> tuple[Array,
         lag, reach = _refined(pair, last)
         move = reference.begin - lag / rate - unit.begin
         found.append(move if abs(move) * rate > reach else 0.0)
-        remarks.append(f"{unit.name} is moved by {found[-1]:+.4g} s to the clock of {reference.name}")
+        by = f"is moved by {found[-1]:+.4g} s to" if found[-1] else "is already on"
+        remarks.append(f"{unit.name} {by} the clock of {reference.name}")
     words = "these moves are coarse: what is left is found with the modes (late sensor)"
     return np.insert(np.array(found), first, 0.0), [*remarks, words]
 
@@ -134,8 +135,8 @@ def _refined(pair: _Pair, last: float, fewest: int = 10) -> tuple[int, float]:
     line, moved = np.arange(X.size), np.abs(Y) ** 2
     power = np.abs(np.fft.rfft(pair.base * np.hanning(pair.base.size), n)) ** 2  # without leakage of what was cut off
     slow = (line < last * n) & (power > _least(power))
-    low = np.quantile(line[slow], 0.1) if np.any(slow) else 0.0
-    if np.count_nonzero(slow) < fewest or 2 * low > last * n:  # of less than an octave one period passes for another
+    # Of less than an octave one period passes for another.
+    if np.count_nonzero(slow) < fewest or 2 * np.quantile(line[slow], 0.1) > last * n:
         return pair.lag, float(2 * n * moved.sum() / np.sum(line * moved))
     shared = np.abs(np.fft.irfft(np.where(slow, Y * X.conj(), 0.0), n))
     near = pair.lag + np.arange(-int(1 / last), int(1 / last) + 1)

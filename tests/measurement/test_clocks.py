@@ -29,7 +29,7 @@ def late_records(delays, seed=0):
 
 def stated(delays):
     """Sensors that state their delays, and those of base and force."""
-    sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x", delay) for i, delay in enumerate(delays[:-2])]
+    sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x", delay=delay) for i, delay in enumerate(delays[:-2])]
     return {"sensors": sensors, "base_delay": delays[-2], "force_delay": delays[-1]}
 
 

@@ -332,7 +332,8 @@ def _late(test: Measurement, delays: Delays) -> Iterator[Finding]:
 
 def _digits(delay: float, std: float, of_base: bool) -> str:
     """A delay, s, to a tenth of its deviation at least; that of the base is the others' with the other sign."""
-    return f"{(-1) ** of_base * delay:.{int(np.clip(1 - np.floor(np.log10(max(std, 1e-9))), 6, 9))}f}"
+    digits = int(np.clip(1 - np.floor(np.log10(max(std, 1e-9))), 6, 9))
+    return f"{round((-1) ** of_base * delay, digits):.9g}"
 
 
 def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding, ...]:
