@@ -217,7 +217,9 @@ BENCHMARKS = (
     Benchmark(
         "band.no_modes_above", "structures without modes above the lines: what residual modes cost", "4 min", "20 s"
     ),
-    Benchmark("channels.gains", "gains within tolerances, and wrong ones, beside modes above the band", "20 min", "20 s"),
+    Benchmark(
+        "channels.gains", "gains within tolerances, and wrong ones, beside modes above the band", "20 min", "20 s"
+    ),
     Benchmark("channels.delays", "late channels: found first, how exactly; none on one clock", "10 min", "25 s"),
     Benchmark(
         "channels.signed_exports", "exported files of a sensor at -x: sign in the row's name, or turned", "5 s", "3 s"

@@ -117,9 +117,7 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
     """The sensors of the responses, each once."""
     found = {channel.name: channel for channel in said.channels if channel.role == "response"}
     points = {name: channel.position or (0.0, 0.0, 0.0) for name, channel in found.items()}
-    return tuple(
-        Sensor(name, points[name], channel.axis, gain_std=channel.gain_std) for name, channel in found.items()
-    )
+    return tuple(Sensor(name, points[name], channel.axis, gain_std=channel.gain_std) for name, channel in found.items())
 
 
 def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Array | None]:

@@ -14,7 +14,16 @@ import numpy as np
 
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
-from sysid.files.assembly import base_directions, delays_in_words, described, row_of, run_of, sensors_of, tolerances_of, work_of_force
+from sysid.files.assembly import (
+    base_directions,
+    delays_in_words,
+    described,
+    row_of,
+    run_of,
+    sensors_of,
+    tolerances_of,
+    work_of_force,
+)
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column

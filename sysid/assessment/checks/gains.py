@@ -185,14 +185,14 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
 
 
 def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
-    """Gains that are wrong: of the base, a table that rocks, or single sensors, the worst first."""
+    """Gains that are wrong: of the base, or of single sensors, the worst first."""
     explained = np.zeros(test.n_sensors, bool)
     for axis, name in enumerate(test.base_axes):
-        driven = np.abs(seen_at_sensors(test)[:, test.n_sensors + axis]) > _DRIVEN
+        driven = _driven(test, axis)
         base = errors.of_base(driven)
-        found = list(_rocking(test, errors, axis, driven)) if base is None else [_of_base(name, base, errors, driven)]
-        explained |= driven & bool(found)
-        yield from found
+        if base is not None:
+            explained |= driven
+            yield _of_base(name, base, errors, driven)
     for i in [one for one in errors.wrong if not explained[one]][:MOST_OF_A_KIND]:
         error, name = float(errors.error[i]), test.sensor_names[i]
         yield Finding(
@@ -203,6 +203,11 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
             "correct its axis or its row of rigid_body", channel=name,
             numbers={"gain": 1 + error, "std": float(errors.std[i])},
         )  # fmt: skip
+
+
+def _driven(test: Measurement, axis: int) -> NDArray[np.bool_]:
+    """Sensors that move with the base mostly along one of its directions, (n_sensors,)."""
+    return np.asarray(-seen_at_sensors(test)[:, test.n_sensors + axis] > _DRIVEN)
 
 
 def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.bool_]) -> Finding:
@@ -217,9 +222,15 @@ def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.boo
     )  # fmt: skip
 
 
-def _rocking(test: Measurement, errors: GainErrors, axis: int, driven: NDArray[np.bool_]) -> Iterator[Finding]:
+def rocking_table(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
     """Errors of gains rise with the sensors' places, as a rotation of the table with its motion along an axis makes."""
-    known = driven & np.isfinite(errors.error)
+    for axis in range(test.n_base):
+        if errors.of_base(_driven(test, axis)) is None:
+            yield from _rocking(test, errors, axis)
+
+
+def _rocking(test: Measurement, errors: GainErrors, axis: int) -> Iterator[Finding]:
+    known = _driven(test, axis) & np.isfinite(errors.error)
     if test.sensors is None or np.count_nonzero(known) < 3 or not np.any(known[errors.wrong]):
         return
     rows = rigid_body(sensors=test.sensors, base_axes=BASE_AXES)
