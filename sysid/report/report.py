@@ -139,7 +139,7 @@ def render(identification: Identification) -> str:
             ("Unknowns", _unknowns(it)),
             ("Matrices", matrix_tables(it)),
             ("Noise", _noise(it)),
-            ("Gains", _gains(it)),
+            ("Sensors", _sensors(it)),
             ("Outliers", _outliers(it)),
             ("Poles in the data", _poles(it)),
             ("Modal assurance criterion", _mac(it)),
@@ -303,15 +303,24 @@ def _noise(it: Identification) -> str:
     return table(("channel", *tables.NOISE_COLUMNS), rows, caption)
 
 
-def _gains(it: Identification) -> str:
-    """The gain of each sensor as the records show it."""
+def _sensors(it: Identification) -> str:
+    """The gain of each sensor as the records show it, and its delay."""
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
     found = tables.gains_of_sensors(it)
     priced = it.determined and any(g.worth > 0 for g in found)  # else M_SS has no deviation, or was stated
     caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
-    head = ("sensor", "gain", "±", *["1 % moves M_SS by, deviations"] * priced)
-    rows = [(g.sensor, *rounded(g.gain, g.std), *[number(g.worth, 2)] * priced) for g in found]
+    if it.modal[0].calibration is not None:
+        caption += " Tolerances are stated: what is likely within them was taken off, and intervals of M, K and C hold "
+        caption += "the rest."
+    late = any(g.delay for g in found)
+    caption += " Delay: by which the records were late, and which was taken off." * late
+    head = ("sensor", "gain", "±", *["delay, ms", "±"] * late, *["1 % moves M_SS by, deviations"] * priced)
+    rows = [
+        (g.sensor, *rounded(g.gain, g.std), *rounded(1e3 * g.delay, 1e3 * g.delay_std) * late,
+         *[number(g.worth, 2)] * priced)
+        for g in found
+    ]  # fmt: skip
     return table(head, rows, caption)
 
 

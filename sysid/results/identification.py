@@ -224,7 +224,14 @@ class Identification(Answer):
                 for c in noise_of_channels(self)
             ],
             "gains": [
-                {"sensor": g.sensor, "gain": g.gain, "std": g.std, "deviations_per_percent": _plain(np.array(g.worth))}
+                {
+                    "sensor": g.sensor,
+                    "gain": g.gain,
+                    "std": g.std,
+                    "delay": g.delay,
+                    "delay_std": g.delay_std,
+                    "deviations_per_percent": _plain(np.array(g.worth)),
+                }
                 for g in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from sysid.assessment.checks.model_error import LEVEL
 from sysid.assessment.checks.stated import sides_of
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.response import of_residual_modes, residual_share
 from sysid.results.answer import Answer
@@ -65,12 +66,15 @@ class SensorGain(NamedTuple):
     """Gain of a sensor against the base's, its standard deviation, and what 1 % of it does to M_SS.
 
     `worth` is in stated deviations of the diagonal entry that moves by most of them; NaN where there is no noise.
+    `delay`, s, was taken off; zero where it is on the base's clock.
     """
 
     sensor: str
     gain: float
     std: float
     worth: float
+    delay: float = 0.0
+    delay_std: float = 0.0
 
 
 def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
@@ -80,8 +84,9 @@ def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
     found, names = it.gains, it.measurement.sensor_names
     known = np.isfinite(found.error)
     worth = np.where(np.nan_to_num(found.std) > EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
+    late = it.modal[0].delays or Delays.none(it.measurement)
     return tuple(
-        SensorGain(names[i], 1 + float(found.error[i]), float(found.std[i]), float(worth[i]))
+        SensorGain(names[i], *(float(one[i]) for one in (1 + found.error, found.std, worth, late.values, late.std)))
         for i in np.flatnonzero(known)
     )
 

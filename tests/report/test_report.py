@@ -73,7 +73,7 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
     page = Page(page)
     assert page.headings == [
         "How far to trust it", "Modes", "Mode shapes", "Measured against identified", "Validation", "Total mass",
-        "Matrices", "Gains", "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
+        "Matrices", "Sensors", "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
     ]  # fmt: skip
     opening, rest = page.text.split("How far to trust it", 1)
     f, percent = complete.structure.natural_frequencies, 100 * complete.structure.damping_ratios

@@ -27,6 +27,7 @@ from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
+_USUAL = 0.015  # of a gain; the tolerance of an accelerometer is a third of it
 _UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
@@ -200,9 +201,14 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
             f"{name} reads {100 * abs(error):.2g} % {'high' if error > 0 else 'low'} against the base (standard "
             f"deviation {100 * errors.std[i]:.1g} %): M_SS, K_SS and C are wrong in its row and column",
             f"calibrate it and divide its record by {1 + error:.4f} (gain = {1 + error:.4f} in sensors.toml), or "
-            "correct its axis or its row of rigid_body", channel=name,
+            f"correct its axis or its row of rigid_body{_within(error)}", channel=name,
             numbers={"gain": 1 + error, "std": float(errors.std[i])},
         )  # fmt: skip
+
+
+def _within(error: float) -> str:
+    """The remedy beside others of an error that is a usual tolerance."""
+    return ", or state its tolerance (gain_std, --gain-std 0.005)" if abs(error) < _USUAL else ""
 
 
 def _driven(test: Measurement, axis: int) -> NDArray[np.bool_]:
@@ -217,7 +223,8 @@ def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.boo
         "gain", Severity.CONTRADICTS,
         f"the base {name} reads {100 * abs(gain - 1):.2g} % {'high' if gain > 1 else 'low'} against all sensors that "
         f"move with it (standard deviation {100 * std:.1g} %): M, K and C are wrong by as much",
-        f"calibrate it and divide its record by {gain:.4f} (gain = {gain:.4f} in sensors.toml)", channel=f"base {name}",
+        f"calibrate it and divide its record by {gain:.4f} (gain = {gain:.4f} in sensors.toml){_within(error)}",
+        channel=f"base {name}",
         numbers={"gain": gain, "std": std},
     )  # fmt: skip
 
