@@ -177,7 +177,8 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
             other = _settled(_Late(still, clocks, far, at.at.poles))
             end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
-    if not end.explains_more_than(complex_):
+    # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
+    if complex_.shows_beyond(end) or not end.explains_more_than(complex_):
         end = _settled(complex_)
         if not end.explains_more_than(complex_):
             return none
@@ -273,9 +274,19 @@ class _Late:
 
     def explains_more_than(self, other: _Late) -> bool:
         """True where the likelihood is larger, each channel with its own level of noise, than Schwarz's price says."""
+        gained, more, numbers = self._gained_over(other)
+        return gained > more * np.log(numbers) / 2
+
+    def shows_beyond(self, other: _Late) -> bool:
+        """True where it has more unknowns and the likelihood is larger beyond what chance makes of these."""
+        gained, more, _ = self._gained_over(other)
+        return more > 0 and 2 * gained > beyond_chance(more, self.delays.size)
+
+    def _gained_over(self, other: _Late) -> tuple[float, int, float]:
+        """Likelihood over another's, its logarithm, unknowns more than it has, and independent numbers of both."""
         numbers = self.left.size / min(self.shared_errors, other.shared_errors)
         more = self.unknowns - other.unknowns + np.count_nonzero(self.delays) - np.count_nonzero(other.delays)
-        return numbers * np.mean(np.log(other.level / self.level)) > more * np.log(numbers) / 2
+        return numbers * float(np.mean(np.log(other.level / self.level))), int(more), numbers
 
     @cached_property
     def equations(self) -> tuple[Array, Array]:

@@ -177,3 +177,12 @@ def test_stored_delays_of_another_test_are_refused():
 
 def test_find_delays_without_poles_finds_none():
     assert not find_delays(spectra(LATE[0]), None)
+
+
+@pytest.mark.parametrize(("loss", "seed"), [(10.0, 1), (5.0, 1), (5.0, 3)])
+def test_dampers_of_a_small_structure_are_no_delays(loss, seed):
+    """Two masses on equal dampers: complex residues of two modes cost little more than three delays."""
+    K = np.array([[6500.0, -2500, -4000], [-2500, 2500, 0], [-4000, 0, 4000]])
+    structure = sysid.Structure(np.diag([3.0, 2.0, 0.0]), K, n_base=1, damping_matrix=loss * np.eye(2))
+    test = sysid.simulate(structure, np.linspace(1, 12, 150), noise=0.02, force=True, rng=seed)
+    assert not Clock.of(test).delays
