@@ -6,6 +6,7 @@ import pytest
 
 import sysid
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 N = 3
 STRETCH = np.eye(N) - np.eye(N, k=-1)
 MASSES, SPRINGS = np.array([3.0, 2.0, 2.5]), np.array([4000.0, 3000.0, 2500.0])

@@ -17,7 +17,7 @@ W = 2 * np.pi * FREQ
 MASSES, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 ONE_START = sysid.Continuation(starts=1)
-pytestmark = pytest.mark.usefixtures("no_other_answers")  # of which a loss tells nothing
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 
 
 def chain(values):
