@@ -16,6 +16,7 @@ import pytest
 
 import sysid
 from sysid.modal_analysis import fit
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.model import Geometry
 from sysid.search.continuation import Continuation
@@ -63,14 +64,17 @@ def _from_one_start():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Continuation.__init__, "__defaults__", (1,))
         patch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
+        patch.setattr("sysid.modal_analysis.delays.find_delays", lambda test, beside: Delays.none(test))
         yield
 
 
 @pytest.fixture(scope="session")
 def from_one_start():
-    """Give a context in which "auto" begins at the guess alone and looks for no other answers: a third of the time.
+    """Give a context in which "auto" begins at the guess alone, and neither other answers nor delays are looked for.
 
-    Several starts are tested in tests/search/test_continuation.py and, on bundled problems, in test_reference.py.
+    That takes a third of the time. Several starts are tested in tests/search/test_continuation.py and, on bundled
+    problems, in test_reference.py; other answers in tests/search/test_other_answers.py, delays in
+    tests/modal_analysis/test_delays.py.
     """
     return _from_one_start
 

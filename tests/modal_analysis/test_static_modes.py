@@ -152,7 +152,7 @@ def test_deviations_are_those_of_a_dense_jacobian_with_the_far_pole_held(spectra
 def whole(truth):
     """A record cut in motion, its lines up to the fourth mode; sampled far above all modes."""
     rng = np.random.default_rng(2)
-    motion = random_motion(rng, 30.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
+    motion = random_motion(rng, 15.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
     records, _ = with_noise(Run.ringing(SimulatedModes.of(truth), motion, rng).records(), rng, 0.02)
     return sysid.Measurement.from_time(
         [(records.base, records.response, records.force)], 200.0, rigid_body=truth.rigid_body, band=(2.0, 15.0)

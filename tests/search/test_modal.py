@@ -220,9 +220,8 @@ class TestStructuredMass:
         stiffness = made.stiffness if given else sysid.SpectralStiffness()
         return truth, sysid.Problem(test, mass=made.mass, stiffness=stiffness)
 
-    @pytest.mark.parametrize("given", [False, True])
     @pytest.mark.parametrize("mass", ["lumped", "known"])
-    @pytest.mark.parametrize(("n", "d"), [(4, 1), (6, 3)])
+    @pytest.mark.parametrize(("n", "d", "given"), [(4, 1, False), (4, 1, True), (6, 3, False)])
     def test_without_noise_it_is_exact(self, random_case, n, d, mass, given):
         truth, problem = self.problem(random_case, mass, n, d, noise=0.0, given=given)
         result = sysid.identify(problem, rng=0)
@@ -232,7 +231,7 @@ class TestStructuredMass:
         within(result, truth, 1e-9)
 
     @pytest.mark.parametrize("mass", ["lumped", "known"])
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", range(2))
     def test_with_noise_it_ends_at_the_floor(self, random_case, seed, mass):
         """Least squares leave less than the truth does, and less by no more than as many unknowns can take."""
         truth, problem = self.problem(random_case, mass, 4, 2, noise=0.01, given=False, seed=seed)
@@ -286,10 +285,10 @@ def test_runs_that_move_the_base_in_all_directions_at_once(random_structure, noi
 def test_a_sensor_that_is_stated_to_be_noisy_spoils_nothing(random_structure):
     """One of four with 100 times the noise: errors as small as their bound, and an order larger where it is not stated.
 
-    Frequencies and damping ratios of eight structures; the root mean square of 64 normal numbers.
+    Frequencies and damping ratios of four structures; the root mean square of 32 normal numbers.
     """
     stated, unstated, bound = [], [], []
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         truth = random_structure(rng, n=4, d=2)
         clean = sysid.simulate(truth, lines(truth))
