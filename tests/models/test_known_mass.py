@@ -9,6 +9,7 @@ import sysid
 from sysid import FullMass, InputError, Problem, Structure, identify, simulate
 from sysid.search.session import DeferredInterrupt, Session
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 MASSES, SPRINGS = np.array([12.0, 9.0, 15.0]), np.array([4e4, 3e4, 2e4])
 
 

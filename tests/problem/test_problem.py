@@ -13,6 +13,7 @@ from sysid.models.expressions import triangle, triangle_entries
 from sysid.models.spectrum import nearest_factors
 from sysid.problem import batch as candidates
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")
 COMBINATIONS = list(itertools.product(MASSES, ("spectral", "chain"), ("modal", "proportional")))
@@ -93,7 +94,7 @@ def assert_residuals(problem, rows, *, refine):
         assert problem.objective(x) == pytest.approx(expected, rel=tolerance)
         assert problem.residual(x) == pytest.approx(problem.measurement.residual(structure), rel=tolerance)
         checked += 1
-    assert checked >= 8
+    assert checked >= 4
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -129,9 +129,7 @@ def test_a_mass_of_its_own_form_has_a_mode_a_sensor(at_once, spectra):
         sysid.identify(problem, strategy=sysid.Modal(modes=2), rng=0)
 
 
-@pytest.mark.parametrize(
-    ("kind", "which"), [("spectra", [0, 1, 2, 3]), ("spectra", [0, 2]), ("records", [0, 2])]
-)
+@pytest.mark.parametrize(("kind", "which"), [("spectra", [0, 1, 2, 3]), ("spectra", [0, 2]), ("records", [0, 2])])
 def test_stated_frequencies_are_the_modes_of_the_answer(request, truth, kind, which):
     """Each is given to two digits; modes between and beside them are none of the structure's."""
     stated = [float(f"{f:.2g}") for f in truth.natural_frequencies[which]]

@@ -9,6 +9,7 @@ from sysid.models.expressions import triangle_entries
 from sysid.search.inverse_factor_coordinates import InverseFactorError, _residual_of, coordinates_of
 from sysid.search.swarm_objective import SwarmObjective
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 OWN = np.array([2.0, 4.5, 7.0])  # Hz
 FREQ = np.unique(np.concatenate([np.linspace(1.0, 8.5, 60), *(f * (1 + 0.02 * np.linspace(-2, 2, 9)) for f in OWN)]))
 
