@@ -105,7 +105,7 @@ def _run_cell(source, file, names):
 
 def _png(figure):
     file = io.BytesIO()
-    figure.savefig(file, format="png")
+    figure.savefig(file, format="png", dpi=50)
     return file.getvalue()
 
 

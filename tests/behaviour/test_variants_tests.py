@@ -138,9 +138,9 @@ def test_magnitudes_hold_no_phase_and_the_misfit_is_of_magnitudes():
     np.testing.assert_allclose(problem.residual(x), difference, rtol=1e-10)
 
 
-def test_the_swarm_finds_a_structure_from_magnitudes():
+def test_the_swarm_finds_a_structure_from_magnitudes(identified_from_guess):
     known = module("magnitude_only")
-    result = sysid.identify(known["problem"](), rng=0, strategy=sysid.Swarm(max_iterations=20, restarts=0))
+    result = identified_from_guess(known["problem"](), 0, sysid.Swarm(max_iterations=20, restarts=0))
     assert result.success
     np.testing.assert_allclose(result.values["spring"], known["SPRINGS"], rtol=1e-6)
 
