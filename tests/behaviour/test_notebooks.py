@@ -2,12 +2,13 @@
 
 Jupyter executes the one on records where there are none, in a kernel of its own; all run cell by cell in this process,
 as a kernel does it, without the seconds that a new process spends on its imports; their searches begin at the guess
-alone, and neither other answers nor frequencies that change are looked for, which takes half of the time.
+alone, neither other answers nor frequencies that change are looked for, and the poles of records are found once.
 """
 
 import ast
 import base64
 import contextlib
+import functools
 import io
 import json
 import os
@@ -17,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from sysid.modal_analysis import modal_estimate
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.py"))
 REAL = [path for path in NOTEBOOKS if "SYSID_DATA" in path.read_text(encoding="utf-8")]
@@ -70,6 +73,7 @@ def in_this_process(tmp_path, monkeypatch, from_one_start):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sysid.assessment.checks.model_error.changes", lambda problem: [])
+    monkeypatch.setattr(modal_estimate, "find_poles", functools.cache(modal_estimate.find_poles))
     before = mpl.get_backend()
     mpl.use("agg")
 
