@@ -102,8 +102,7 @@ def test_a_force_in_two_directions_goes_by_lines():
     assert SwarmObjective(made.prepared, spectrum=made.formulation.stiffness.spectrum)._held is None
 
 
-@pytest.mark.parametrize("strategy", ["swarm", "hpso-ls"])
-@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(("strategy", "force"), [("swarm", False), ("swarm", True), ("hpso-ls", True)])
 def test_searches_fit_to_the_noise_and_find_the_modes_in_the_lines(strategy, force):
     structure = truth()
     result = sysid.identify(problem(structure, force=force), strategy=strategy, rng=0)
