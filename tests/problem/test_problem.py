@@ -13,7 +13,6 @@ from sysid.models.expressions import triangle, triangle_entries
 from sysid.models.spectrum import nearest_factors
 from sysid.problem import batch as candidates
 
-pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")
 COMBINATIONS = list(itertools.product(MASSES, ("spectral", "chain"), ("modal", "proportional")))
