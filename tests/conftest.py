@@ -1,5 +1,6 @@
 """Random structures that the tests share, built from modes and geometry: their properties are known beforehand."""
 
+import contextlib
 import importlib.util
 import os
 import signal
@@ -15,8 +16,10 @@ import pytest
 
 import sysid
 from sysid.modal_analysis import fit
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.model import Geometry
+from sysid.search.continuation import Continuation
 
 
 def _import_benchmarks():
@@ -56,11 +59,30 @@ def no_other_answers(monkeypatch):
     monkeypatch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
 
 
-@pytest.fixture(scope="module")
-def no_other_answers_in_module():
-    """The same for all tests of a module, and for its fixtures."""
+@contextlib.contextmanager
+def _from_one_start():
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Continuation.__init__, "__defaults__", (1,))
         patch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
+        patch.setattr("sysid.modal_analysis.delays.find_delays", lambda test, beside: Delays.none(test))
+        yield
+
+
+@pytest.fixture(scope="session")
+def from_one_start():
+    """Give a context in which "auto" begins at the guess alone, and neither other answers nor delays are looked for.
+
+    That takes a third of the time. Several starts are tested in tests/search/test_continuation.py and, on bundled
+    problems, in test_reference.py; other answers in tests/search/test_other_answers.py, delays in
+    tests/modal_analysis/test_delays.py.
+    """
+    return _from_one_start
+
+
+@pytest.fixture(scope="module")
+def from_one_start_in_module():
+    """The same for all tests of a module, and for its fixtures."""
+    with _from_one_start():
         yield
 
 

@@ -87,7 +87,7 @@ def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
 def test_a_drift_along_a_record_is_told_with_when_and_what():
     rng = np.random.default_rng(3)
     base, factor = motion(rng, 40.0), lambda t: 1 - 0.04 * t / 40.0
-    it = identified(as_test(noisy(rng, base, answer(base, factor))))
+    it = identified(as_test(noisy(rng, base, answer(base, factor)), estimator="spectra"))
     told = it.of_kind("changing")[0].sentence
     spans = [(float(a) + float(b)) / 2 for a, b in re.findall(r"at ([\d.]+) to ([\d.]+) s", told)]
     expected = [frequencies(factor(t) * SPRINGS) for t in spans]

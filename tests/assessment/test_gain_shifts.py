@@ -9,6 +9,7 @@ import sysid
 from sysid import ChainStiffness, FullMass, LumpedMass, Measurement, Problem, Structure, simulate
 from sysid.assessment.checks.gains import GainErrors, rests_on
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 STEP = 2e-4  # of a gain
 K = 5000.0 * np.array([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 1, 0], [-1, 0, 0, 1]])
 TRUTH, ON_TABLE = (Structure(np.diag([4.0, 3.0, 5.0, base]), K, [0.01, 0.015, 0.02], n_base=1) for base in (0.0, 2.0))

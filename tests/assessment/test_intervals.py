@@ -149,7 +149,7 @@ class TestIntervals:
                 assert np.allclose(ends[:, i, j], expected, rtol=1e-9, atol=1e-9 * np.abs(reach).max())
 
     @pytest.mark.parametrize("healing", ["trace", "rigid_body"])
-    @pytest.mark.parametrize(("n", "d"), [(2, 1), (3, 2), (4, 3), (5, 3)])
+    @pytest.mark.parametrize(("n", "d"), [(2, 1), (3, 2), (5, 3)])
     def test_random_structures_with_totals(self, random_structure, n, d, healing):
         rng = np.random.default_rng(n)
         truth = random_structure(rng, n=n, d=d)

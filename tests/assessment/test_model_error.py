@@ -88,7 +88,7 @@ def test_quiet_parts_tell_the_noise_of_a_record_that_was_at_rest_for_a_while():
 
 def test_hum_far_from_all_modes_is_no_error_of_a_model():
     rng = np.random.default_rng(6)
-    base = motion(rng, seconds=60)
+    base = motion(rng, seconds=30)
     records, floors = noisy(rng, base, answer(base))
     hum = 0.3 * np.sin(2 * np.pi * 16.667 * np.arange(base.size) / RATE)
     it = identified(as_test((records, floors + hum)))

@@ -274,7 +274,7 @@ def test_words_name_each_null_direction(moving):
 
 # -- noise ------------------------------------------------------------------------------------------------------------
 
-DRAWS = 60
+DRAWS = 30
 
 
 def drawn(problem_of, truth, x, noise=0.01, force=False):
@@ -285,7 +285,7 @@ def drawn(problem_of, truth, x, noise=0.01, force=False):
 
 
 def same(stated, values, factor=1.45):
-    """A standard deviation is that of the draws; with 60 of them within some 35 % in 999 of 1000 cases."""
+    """A standard deviation is that of the draws; with 30 of them within 45 % in 999 of 1000 cases."""
     spread = np.std(values, axis=0, ddof=1)
     big = spread > 1e-9 * np.abs(values).max()
     ratio = np.asarray(stated)[big] / spread[big]

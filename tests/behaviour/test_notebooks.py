@@ -1,12 +1,14 @@
 """Every notebook runs from a clean start, without an error or a warning, and draws pictures that show something.
 
 Jupyter executes the one on records where there are none, in a kernel of its own; all run cell by cell in this process,
-as a kernel does it, without the seconds that a new process spends on its imports, and look for no other answers.
+as a kernel does it, without the seconds that a new process spends on its imports; their searches begin at the guess
+alone, neither other answers nor frequencies that change are looked for, and the poles of records are found once.
 """
 
 import ast
 import base64
 import contextlib
+import functools
 import io
 import json
 import os
@@ -16,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from sysid.modal_analysis import modal_estimate
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.py"))
 REAL = [path for path in NOTEBOOKS if "SYSID_DATA" in path.read_text(encoding="utf-8")]
@@ -62,12 +66,14 @@ def in_a_kernel(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def in_this_process(tmp_path, monkeypatch, no_other_answers):
+def in_this_process(tmp_path, monkeypatch, from_one_start):
     """Give a function that does the same in this process; a warning is an error here."""
     import jupytext
     import matplotlib as mpl
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sysid.assessment.checks.model_error.changes", lambda problem: [])
+    monkeypatch.setattr(modal_estimate, "find_poles", functools.cache(modal_estimate.find_poles))
     before = mpl.get_backend()
     mpl.use("agg")
 
@@ -76,7 +82,7 @@ def in_this_process(tmp_path, monkeypatch, no_other_answers):
 
         monkeypatch.setattr(plt, "show", lambda: None)  # what is open is shown when its cell ends
         names, pngs = {"__name__": "__main__"}, []
-        with contextlib.redirect_stderr(io.StringIO()) as complaints, mpl.rc_context():
+        with contextlib.redirect_stderr(io.StringIO()) as complaints, mpl.rc_context(), from_one_start():
             for cell in jupytext.read(path).cells:
                 if cell.cell_type == "code":
                     shown = _run_cell(cell.source, str(path), names)
@@ -103,7 +109,7 @@ def _run_cell(source, file, names):
 
 def _png(figure):
     file = io.BytesIO()
-    figure.savefig(file, format="png")
+    figure.savefig(file, format="png", dpi=50)
     return file.getvalue()
 
 

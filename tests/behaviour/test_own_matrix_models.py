@@ -11,6 +11,9 @@ from sysid.cli.show import show
 from sysid.report import report
 from sysid.search import local
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
+
 with pytest.MonkeyPatch.context() as patch:
     patch.syspath_prepend(str(Path(__file__).parents[1] / "models"))
     own = importlib.import_module("own_models")

@@ -66,7 +66,7 @@ def uninterrupted():
 @pytest.mark.parametrize(
     ("form", "strategy", "shares"),
     [("chain", SHORT, [0.5, 1.0]), ("free", SHORT, ENDS),
-     ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders"), ENDS),
+     ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders"), [0.5, 1.0]),
      ("chain", "auto", [0.5, 1.0]), ("free", "auto", ENDS)],  # of the chain "auto" is continuation
 )  # fmt: skip
 def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, shares, random_case, tmp_path):

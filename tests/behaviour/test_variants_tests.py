@@ -25,6 +25,9 @@ TRUTHS = {
     "five_storeys": {"storey stiffness": "SPRINGS"},
 }  # fmt: skip
 ONCE = sysid.Continuation(starts=1)
+# Without noise others are compared in test_reference.py; of chains, the last two, the benchmarks `six_springs` and
+# `five_storeys` hold the errors to their bound.
+EXACT = ("single_axis", "unmeasured_floors", "frame_sections")
 
 
 def module(name):
@@ -45,7 +48,7 @@ def test_a_variant_is_short_and_takes_no_records(name):
         module(name)["problem"](data="somewhere")
 
 
-@pytest.mark.parametrize("name", TRUTHS)
+@pytest.mark.parametrize("name", EXACT)
 def test_without_noise_a_variant_is_identified_to_round_off(name, identified):
     known = module(name)
     result = identified(name, look=False)
@@ -138,9 +141,9 @@ def test_magnitudes_hold_no_phase_and_the_misfit_is_of_magnitudes():
     np.testing.assert_allclose(problem.residual(x), difference, rtol=1e-10)
 
 
-def test_the_swarm_finds_a_structure_from_magnitudes():
+def test_the_swarm_finds_a_structure_from_magnitudes(identified_from_guess):
     known = module("magnitude_only")
-    result = sysid.identify(known["problem"](), rng=0, strategy=sysid.Swarm(max_iterations=20, restarts=0))
+    result = identified_from_guess(known["problem"](), 0, sysid.Swarm(max_iterations=20, restarts=0))
     assert result.success
     np.testing.assert_allclose(result.values["spring"], known["SPRINGS"], rtol=1e-6)
 

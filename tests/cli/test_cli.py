@@ -20,6 +20,7 @@ from sysid.cli import output
 from sysid.report import report
 from sysid.results.summary import JUDGEMENTS
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 FREQUENCIES = "truth.natural_frequencies"
 KEYS = {
     "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",

@@ -9,6 +9,7 @@ from sysid.cli import main as cli
 from sysid.compare import comparison, peers
 from sysid.errors import how_to_install
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 PNG = b"\x89PNG"
 

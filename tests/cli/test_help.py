@@ -49,7 +49,7 @@ def write_records(folder, sensors):
         (folder / f"{name}.csv").write_text("\n".join(["Time,a [g]", *(f"{k / 50},{x}" for k, x in enumerate(row))]))
 
 
-def test_all_examples_run(helps, tmp_path, monkeypatch, capsys, no_pictures, no_other_answers):
+def test_all_examples_run(helps, tmp_path, monkeypatch, capsys, no_pictures, from_one_start_in_module):
     monkeypatch.chdir(tmp_path)
     # These take longest, and have tests of their own.
     monkeypatch.setattr(peers, "missing_packages", lambda: ["cma"])

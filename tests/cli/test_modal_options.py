@@ -10,6 +10,7 @@ from sysid.cli import main as cli
 from sysid.files.recorded_test import RecordedTest
 from sysid.results.checkpoint import RunRequest
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 MASSES, SPRINGS = np.array([2.0, 3.0, 2.5]), np.array([3.0, 2.0, 1.5]) * 1e4
 NAMES = "low", "middle", "high"
 
@@ -79,14 +80,14 @@ def test_draws_of_an_answer_in_the_band_keep_its_modes_and_sensors(folder, file,
     result = sysid.load(folder / "out")
     assert result.x is None
     capsys.readouterr()
-    assert cli.main(["refine", "out", "--draws", "12", "--workers", "1", "--json"]) == 0
+    assert cli.main(["refine", "out", "--draws", "8", "--workers", "1", "--json"]) == 0
     spreads = {one["name"]: one for one in json.loads(capsys.readouterr().out)["spreads"]}
     assert len(spreads) == 4  # frequencies and ratios
     for k, std in enumerate(result.uncertainty.natural_frequencies, start=1):
         assert spreads[f"mode {k}: frequency, Hz"]["std"] == pytest.approx(std)
-        assert 0.5 < spreads[f"mode {k}: frequency, Hz"]["drawn"] / std < 1.6  # by chance 0.2 off 1
+        assert 0.5 < spreads[f"mode {k}: frequency, Hz"]["drawn"] / std < 1.6  # by chance 0.25 off 1
     rows = (folder / "out" / "refine" / "draws.csv").read_text().splitlines()
-    assert len(rows) == 13 and rows[0].count("mode ") == 4
+    assert len(rows) == 9 and rows[0].count("mode ") == 4
     assert cli.main(["refine", "out", "--starts", "2", "--workers", "1"]) == 2
 
 

@@ -15,6 +15,8 @@ from sysid.cli import doctor
 from sysid.cli import main as cli
 from sysid.errors import how_to_install
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
 
 @pytest.fixture
 def document(capsys):

@@ -17,6 +17,7 @@ from sysid.cli.output import Output
 from sysid.jobs import JobResult
 from sysid.report import report
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "refinement_jobs.md"
 PNG = b"\x89PNG"
 

@@ -11,6 +11,7 @@ from sysid import InputError
 from sysid.cli import main as cli
 from sysid.results.checkpoint import FILE_NAME, Checkpoint
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
 
 KEPT = "--resume takes --seed, --strategy, --refine-by, --modes, --dofs, --data and --set from the run in out"

@@ -16,6 +16,7 @@ from sysid.nlp import NonlinearProgram
 from sysid.results.identification import Recipe
 from sysid.search import local
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 MASSES, SPRINGS, DAMPERS = np.array([4.0, 3.0, 2.0]), np.array([9e3, 7e3, 5e3]), np.array([30.0, 25.0, 20.0])
 STRETCH = np.array([[1.0, 0.0, 0.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, -1.0, 1.0, 0.0]])
 FREQ = np.linspace(0.5, 20.0, 60)

@@ -135,7 +135,7 @@ def test_a_search_without_a_structure_is_a_row_that_says_so(landscape, monkeypat
 def test_peers_take_the_swarms_evaluations_and_its_local_phase(monkeypatch):
     monkeypatch.setattr(peers, "missing_packages", list)
     monkeypatch.setattr(peers, "PEERS", {name: peers.PEERS[name] for name in ("SciPy DE", "SciPy L-BFGS-B")})
-    monkeypatch.setattr(comparison, "NAMED", {"swarm": sysid.Swarm})
+    monkeypatch.setattr(comparison, "NAMED", {"swarm": lambda: sysid.Swarm(max_iterations=30)})
     first, second = (comparison.compare(two_masses(), rng=1).results for _ in range(2))
     swarm = next(result for result in first if result.name == "swarm")
     for one, other in zip(first[-2:], second[-2:], strict=True):

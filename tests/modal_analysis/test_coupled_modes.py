@@ -231,13 +231,18 @@ def test_damping_that_feeds_energy_in_is_not_passive():
     assert passive(parameters(1.0)) and not passive(parameters(20.0))
 
 
+@pytest.fixture(scope="module")
+def answered():
+    """The answer of spectra of a structure whose modes a dashpot of 8 N s/m couples."""
+    test = sysid.simulate(building(8.0), np.geomspace(1.2, 14.0, 200), noise=0.005, force=True, rng=1)
+    return sysid.identify(sysid.Problem(test), rng=0)
+
+
 @pytest.mark.parametrize("records", [False, True])
-def test_the_answer_has_the_damping_matrix_with_honest_deviations(records, tmp_path):
-    truth = building(8.0)
-    test = record(truth, 0.005, np.random.default_rng(6))
-    if not records:
-        test = sysid.simulate(truth, np.geomspace(1.2, 14.0, 200), noise=0.005, force=True, rng=1)
-    result = sysid.identify(sysid.Problem(test), rng=0)
+def test_the_answer_has_the_damping_matrix_with_honest_deviations(records, answered, tmp_path):
+    truth, result = building(8.0), answered
+    if records:
+        result = sysid.identify(sysid.Problem(record(truth, 0.005, np.random.default_rng(6))), rng=0)
     assert result.determined and result.structure.n == 3
     off = (result.structure.damping - truth.damping) / result.uncertainty.damping
     assert np.sqrt(np.mean(off**2)) < 2.5
@@ -256,10 +261,9 @@ def test_exact_spectra_give_the_damping_matrix_to_round_off():
     np.testing.assert_allclose(result.structure.damping, truth.damping, atol=1e-8 * truth.damping.max())
 
 
-def test_draws_of_noise_are_about_the_damping_matrix_of_the_answer():
+def test_draws_of_noise_are_about_the_damping_matrix_of_the_answer(answered):
     """Ratios as unknowns would stand for another structure, so that it tells none."""
-    test = sysid.simulate(building(8.0), np.geomspace(1.2, 14.0, 200), noise=0.005, force=True, rng=1)
-    answer = sysid.identify(sysid.Problem(test), rng=0)
+    answer = answered
     assert answer.x is None and not answer.structure.modal_damping
     found = sysid.identify(drawn_from(answer, np.random.SeedSequence(3)), rng=0)
     assert found.residual == pytest.approx(answer.residual, rel=0.1)

@@ -13,7 +13,7 @@ from sysid.modal_analysis.direct_terms import beside_poles
 from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.residual_tests import delays_left, delays_of
 
-SETTING = replace(four_storeys(150.0), duration=60.0)
+SETTING = replace(four_storeys(150.0), duration=40.0)
 FREQ = np.linspace(1.3, 16.0, 300)
 MS = 1e-3
 

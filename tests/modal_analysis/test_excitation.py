@@ -29,7 +29,7 @@ def at_a_sine(cycles: float, noise: float) -> sysid.Measurement:
     return measured(with_noise(records, rng, noise)[0])
 
 
-@pytest.mark.parametrize(("cycles", "noise"), [(129, 0), (129, 0.01), (129.4, 0)])
+@pytest.mark.parametrize(("cycles", "noise"), [(129, 0.01), (129.4, 0)])
 def test_a_steady_sine_is_told_and_no_unit_or_sign_is_accused(cycles: float, noise: float) -> None:
     with pytest.raises(sysid.InputError, match=r"steady sine at 4\.3.* Hz") as caught:
         sysid.identify(sysid.Problem(at_a_sine(cycles, noise), mass=sysid.FullMass()), rng=0)

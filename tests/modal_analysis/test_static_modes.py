@@ -16,6 +16,8 @@ from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter_over_blocks
 from sysid.structure.structure import Structure
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
 
 @pytest.fixture(scope="module")
 def truth(random_structure):
@@ -67,7 +69,7 @@ def test_the_modes_in_the_lines_are_determined_within_their_deviations(truth, fo
     assert np.abs(off).max() < 4
 
 
-@pytest.mark.parametrize("number", [0, 3, 9])
+@pytest.mark.parametrize("number", [0, 3])
 def test_poles_close_above_the_lines_draw_nothing_off_the_modes_within(number):
     """Without a pole beside the static modes the last mode of this frame bends, and passes for coupled damping."""
     frame = continuous_structure(1)
@@ -152,7 +154,7 @@ def test_deviations_are_those_of_a_dense_jacobian_with_the_far_pole_held(spectra
 def whole(truth):
     """A record cut in motion, its lines up to the fourth mode; sampled far above all modes."""
     rng = np.random.default_rng(2)
-    motion = random_motion(rng, 30.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
+    motion = random_motion(rng, 15.0, 200.0, (1.0, 30.0), correlation=np.eye(2))
     records, _ = with_noise(Run.ringing(SimulatedModes.of(truth), motion, rng).records(), rng, 0.02)
     return sysid.Measurement.from_time(
         [(records.base, records.response, records.force)], 200.0, rigid_body=truth.rigid_body, band=(2.0, 15.0)

@@ -9,6 +9,7 @@ import sysid
 from sysid import FullMass, InputError, Problem, Structure, identify, simulate
 from sysid.search.session import DeferredInterrupt, Session
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 MASSES, SPRINGS = np.array([12.0, 9.0, 15.0]), np.array([4e4, 3e4, 2e4])
 
 
@@ -72,8 +73,8 @@ def test_no_coupling_to_the_base_says_nothing_where_the_data_show_that_there_is_
 
 
 def drawn(truth: Structure, freq: np.ndarray, known: np.ndarray, noise: float) -> tuple[Problem, list[Structure]]:
-    """The first problem of 60 draws of noise, and the answer of each, not judged."""
-    problems = [Problem(simulate(truth, freq, noise=noise, rng=i), mass=FullMass(known=known)) for i in range(60)]
+    """The first problem of 30 draws of noise, and the answer of each, not judged."""
+    problems = [Problem(simulate(truth, freq, noise=noise, rng=i), mass=FullMass(known=known)) for i in range(30)]
     session = Session([], DeferredInterrupt())
     return problems[0], [sysid.Modal().run(problem.prepared, session, None).structure for problem in problems]
 
@@ -86,7 +87,7 @@ def test_what_known_masses_leave_uncertain_is_what_scatters():
         scatter = np.std([getattr(draw, name)[:n, :n] for draw in draws], axis=0, ddof=1)
         moving = scatter > 1e-9 * scatter.max()
         assert np.all(np.isfinite(std))
-        # 60 draws tell a standard deviation to 9 %.
+        # 30 draws tell a standard deviation to 13 %.
         np.testing.assert_allclose(std[moving], scatter[moving], rtol=0.35)
         assert np.all(std[~moving] < 1e-6 * std.max())
     scatter = np.std([draw.participation[:, 0] for draw in draws], axis=0, ddof=1)

@@ -15,7 +15,7 @@ MASSES, SPRINGS = np.array([2.0, 3.0]), np.array([700.0, 3000.0])
 TRUE = np.sqrt(SPRINGS / MASSES) / (2 * np.pi)  # Hz: two oscillators apart
 FREQ = np.linspace(1.0, 8.0, 90)
 ONE = np.ones((2, 1))
-pytestmark = pytest.mark.usefixtures("no_other_answers_in_module")
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 
 
 class NaturalFrequencies:

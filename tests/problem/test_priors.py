@@ -14,7 +14,7 @@ STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2000.0, 1500.0]), np.array([3.0, 2.0])
 FREQ = np.linspace(0.5, 6.0, 150)
 QUICK = sysid.Continuation(starts=1)
-pytestmark = pytest.mark.usefixtures("no_other_answers_in_module")
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 
 
 def measured(seed, noise=0.01, mass=MASS):

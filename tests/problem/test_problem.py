@@ -71,7 +71,7 @@ def test_a_batch_has_the_residual_of_each_structure(random_case, mass, stiffness
     """With a force, the root of the sum of both squared relative residuals."""
     rng = np.random.default_rng(1)
     _, problem = random_case(rng, mass, stiffness, damping, n=4, force=force)
-    rows = particles(rng, problem, 12)
+    rows = particles(rng, problem, 6)
     assert_residuals(problem, rows, refine=False)
     assert problem.formulation.refinable == (stiffness == "spectral")
     if problem.formulation.refinable:
@@ -93,7 +93,7 @@ def assert_residuals(problem, rows, *, refine):
         assert problem.objective(x) == pytest.approx(expected, rel=tolerance)
         assert problem.residual(x) == pytest.approx(problem.measurement.residual(structure), rel=tolerance)
         checked += 1
-    assert checked >= 8
+    assert checked >= 4
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -12,7 +12,7 @@ FREQ = np.linspace(1.0, 30.0, 40)
 ONE = np.ones((2, 1))
 MASSES, SPRINGS, DAMPERS = np.array([3.0, 2.0]), np.array([2e4, 1.5e4]), np.array([8.0, 5.0])
 T = np.eye(2) - np.eye(2, k=-1)
-pytestmark = pytest.mark.usefixtures("no_other_answers_in_module")
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 
 
 def chain(k):

@@ -15,6 +15,8 @@ from sysid.search import modal_program
 from sysid.search.modal import degrees_of_freedom
 from sysid.search.session import DeferredInterrupt, Session
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
 
 def structure(seed, n, d):
     """Random full, coupled mass and stiffness, damping from 0.3 % (below the swarm's box) to 4 %."""
@@ -180,7 +182,7 @@ def test_a_repeated_pole_is_two_modes_where_the_base_force_weighs_them():
 
 def test_a_wrong_sign_in_the_symbolic_residual_alone_is_no_success(monkeypatch):
     """An estimate is no end: IPOPT judges it by another form of the residual, and both must agree."""
-    right, truth = modal_program.modal_gains, structure(0, 3, 1)
+    right, truth = modal_program.modal_gains, structure(0, 2, 1)
     problem = sysid.Problem(sysid.simulate(truth, lines(truth), force=True, noise=0.01, rng=0), mass=sysid.FullMass())
     assert sysid.identify(problem, strategy="modal", rng=0).success
     for signs in ((-1, 1), (1, -1)):
@@ -220,9 +222,8 @@ class TestStructuredMass:
         stiffness = made.stiffness if given else sysid.SpectralStiffness()
         return truth, sysid.Problem(test, mass=made.mass, stiffness=stiffness)
 
-    @pytest.mark.parametrize("given", [False, True])
     @pytest.mark.parametrize("mass", ["lumped", "known"])
-    @pytest.mark.parametrize(("n", "d"), [(4, 1), (6, 3)])
+    @pytest.mark.parametrize(("n", "d", "given"), [(4, 1, False), (4, 1, True), (6, 3, False)])
     def test_without_noise_it_is_exact(self, random_case, n, d, mass, given):
         truth, problem = self.problem(random_case, mass, n, d, noise=0.0, given=given)
         result = sysid.identify(problem, rng=0)
@@ -232,7 +233,7 @@ class TestStructuredMass:
         within(result, truth, 1e-9)
 
     @pytest.mark.parametrize("mass", ["lumped", "known"])
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", range(2))
     def test_with_noise_it_ends_at_the_floor(self, random_case, seed, mass):
         """Least squares leave less than the truth does, and less by no more than as many unknowns can take."""
         truth, problem = self.problem(random_case, mass, 4, 2, noise=0.01, given=False, seed=seed)
@@ -286,10 +287,10 @@ def test_runs_that_move_the_base_in_all_directions_at_once(random_structure, noi
 def test_a_sensor_that_is_stated_to_be_noisy_spoils_nothing(random_structure):
     """One of four with 100 times the noise: errors as small as their bound, and an order larger where it is not stated.
 
-    Frequencies and damping ratios of eight structures; the root mean square of 64 normal numbers.
+    Frequencies and damping ratios of four structures; the root mean square of 32 normal numbers.
     """
     stated, unstated, bound = [], [], []
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         truth = random_structure(rng, n=4, d=2)
         clean = sysid.simulate(truth, lines(truth))

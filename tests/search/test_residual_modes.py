@@ -9,6 +9,7 @@ from sysid.models.expressions import triangle_entries
 from sysid.search.inverse_factor_coordinates import InverseFactorError, _residual_of, coordinates_of
 from sysid.search.swarm_objective import SwarmObjective
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 OWN = np.array([2.0, 4.5, 7.0])  # Hz
 FREQ = np.unique(np.concatenate([np.linspace(1.0, 8.5, 60), *(f * (1 + 0.02 * np.linspace(-2, 2, 9)) for f in OWN)]))
 
@@ -101,8 +102,7 @@ def test_a_force_in_two_directions_goes_by_lines():
     assert SwarmObjective(made.prepared, spectrum=made.formulation.stiffness.spectrum)._held is None
 
 
-@pytest.mark.parametrize("strategy", ["swarm", "hpso-ls"])
-@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(("strategy", "force"), [("swarm", False), ("swarm", True), ("hpso-ls", True)])
 def test_searches_fit_to_the_noise_and_find_the_modes_in_the_lines(strategy, force):
     structure = truth()
     result = sysid.identify(problem(structure, force=force), strategy=strategy, rng=0)
