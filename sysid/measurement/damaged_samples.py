@@ -1,0 +1,349 @@
+"""Damaged samples of records in time: flat tops, gaps, held values, equal channels, spikes, hum of one channel.
+
+Each is judged by its likelihood in a sound record of the same quantisation and rate of change, at one rate of false
+alarms for all channels and samples of a run:
+
+- A quantised record has equal neighbours by chance: where it changes by d a sample, two of them share a step q with
+  probability q / d. Flat tops of smooth motion are no steeper beside them than a parabola.
+- Hum and spikes are what the other channels, or the samples around, do not predict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF
+
+Damage = Literal["equal channels", "clipped", "dropout", "held value", "spikes", "tone"]
+Stretches = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class DamagedSamples:
+    """Damage of one kind in one channel of a run.
+
+    Attributes
+    ----------
+    kind : str
+    channel : int
+        Row of the records.
+    stretches : (k, 2)
+        First and last sample of each, both included.
+    value : float
+        Of "clipped" the largest level in magnitude, of "held value" the first value, of "spikes" the largest height,
+        in the unit of the record; of "tone" its frequency, in cycles a sample; of "equal channels" the other's row.
+    """
+
+    kind: Damage
+    channel: int
+    stretches: Stretches
+    value: float
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return int(np.sum(self.stretches[:, 1] - self.stretches[:, 0] + 1))
+
+
+def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
+    """Damage of the records of a run.
+
+    Parameters
+    ----------
+    records : (channels, n)
+        The base first, `n_base` of them: a base may begin and end at rest while sensors move.
+
+    Returns
+    -------
+    list of DamagedSamples
+        Channel by channel; the worst of each channel first. None of channels that never move.
+    """
+    channels, n = records.shape
+    if n < 2 * _EDGE:
+        return []
+    found = list(_equal(records))
+    held: list[Stretches] = []
+    quanta = [_quantum(record) for record in records]
+    for channel, (record, quantum) in enumerate(zip(records, quanta, strict=True)):
+        stretches = [np.zeros((0, 2), np.intp)]
+        for one in _flat(records, channel, quantum, is_base=channel < n_base):
+            found.append(one)
+            stretches.append(one.stretches)
+        held.append(np.concatenate(stretches))
+    found += _spikes(records, np.array(quanta), held)
+    found += _tones(records, {one.channel for one in found})
+    return sorted(found, key=lambda one: one.channel)
+
+
+def _equal(records: Array, least: int = 50) -> Iterator[DamagedSamples]:
+    """Channels with the same samples as one before, or with their negatives, that change `least` times at least."""
+    sizes = np.sum(np.abs(records), axis=1)
+    for channel in range(1, len(records)):
+        for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
+            one, its = records[channel], records[other]
+            if np.array_equal(np.abs(one), np.abs(its)) and (np.array_equal(one, its) or np.array_equal(one, -its)):
+                if np.count_nonzero(np.diff(one)) >= least:
+                    yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
+                    break
+
+
+# Flat tops and held values.
+
+_EDGE = 8  # samples beside a stretch, by which it is told whether the record moves there
+_AROUND = 64  # of which the motion about a stretch is told
+_LIVELY = 0.25  # of the motion about a stretch: what moves as much up to its edge does not come to rest there
+_STEPS = 1.5  # of a recorder, by which a record moves up to the edges of a stretch
+_NEAREST = 8  # different values next to an extreme one, that tell how densely values lie there
+_MORE = 1.5  # times what they tell, that noise may add
+
+
+def _quantum(record: Array) -> float:
+    """Step of a record: the least difference of neighbours where it is large; equal ones are within round-off."""
+    size = np.abs(record)
+    steps = np.abs(np.diff(record))[size[1:] >= 0.1 * size.max()]
+    tolerance = ROUND_OFF * float(size.max())
+    steps = steps[steps > tolerance]
+    return float(steps.min()) if steps.size else tolerance
+
+
+def _runs(flags: NDArray[np.bool_]) -> Stretches:
+    """First and last of each run of true flags, (k, 2)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return edges.reshape(-1, 2) - [0, 1]
+
+
+def _flat(records: Array, channel: int, quantum: float, *, is_base: bool) -> Iterator[DamagedSamples]:
+    """Flat tops, then gaps, then held values of a channel."""
+    record = records[channel]
+    tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
+    tops = [np.zeros((0, 2), np.intp)]
+    for sign in (1, -1):
+        at = _runs(sign * record >= np.max(sign * record) - tolerance)
+        is_gap = len(at) == 1 and abs(record[at[0, 0]]) <= tolerance
+        if not is_gap and _log_chance_of_tops(sign * record, at, quantum) < chance:
+            tops.append(at)
+    clipped = np.concatenate(tops)
+    if len(clipped):
+        yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
+    at = _runs(np.abs(np.diff(record)) <= tolerance) + [0, 1]
+    at = at[at[:, 1] - at[:, 0] > 1]
+    if len(clipped):
+        at = at[~np.isin(at[:, 0], clipped[:, 0])]
+    at = at[_held(record, at, quantum, FALSE_ALARM / records.size)]
+    at = at[np.array([_others_move(records, channel, stretch, is_base) for stretch in at], dtype=bool)]
+    zero = np.abs(record[at[:, 0]]) <= tolerance
+    if np.any(zero):
+        yield _damage("dropout", channel, at[zero], 0.0)
+    if not np.all(zero):
+        yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
+
+
+def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> DamagedSamples:
+    return DamagedSamples(kind, channel, stretches[np.argsort(stretches[:, 0])], value)
+
+
+def _log_chance_of_tops(record: Array, at: Stretches, quantum: float) -> float:
+    """Logarithm of the chance that a sound record has its highest value at all of these stretches.
+
+    Of steps q. A smooth top of L samples within a step falls by at most ((1 + 2/L)² + 1) q to its neighbours; where
+    both fall by d and more, each further sample shares the step by a chance of q / d. Tops that share a step without
+    a flat are as many as a density with the singularity of a sine makes of the values next to them.
+    """
+    first, last = at.T
+    length, inside = last - first + 1, (first > 0) & (last < record.size - 1)
+    top = record[first[0]]
+    fall = top - np.maximum(record[np.maximum(first - 1, 0)], record[np.minimum(last + 1, record.size - 1)])
+    steep = inside & (length > 1) & (fall > quantum * ((1 + 2 / length) ** 2 + 1))
+    each = np.where(steep, (length - 1) * np.log(quantum / np.where(steep, fall, 1.0)), 0.0)
+    count, flat = len(at), int(np.count_nonzero(steep))
+    after = record[np.minimum(last + 1, record.size - 1)]
+    if count > 2 and np.median(np.abs(after - np.median(after))) < 4 * quantum:  # one phase of a sine: one chance
+        return float(each.min())
+    log = float(each.sum()) + float(np.log(scipy.special.binom(count, flat)) if flat < count else 0.0)
+    below = np.sort(np.partition(record, -min(record.size, int(length.sum()) + 2000))[-int(length.sum()) - 2000 :])
+    below = below[below < top - 0.5 * quantum]
+    distinct = below[np.concatenate([np.diff(below) > 0.5 * quantum, [True]])] if below.size else below
+    if count > 1 and distinct.size >= _NEAREST:
+        share = np.sqrt(quantum / (top - distinct[-_NEAREST] + quantum))  # of a sine's values there, in its last step
+        expected = np.count_nonzero(below >= distinct[-_NEAREST]) * share / (1 - share)
+        log += float(np.log(max(scipy.special.gammainc(count - 1, _MORE * expected), 1e-300)))
+    return log
+
+
+def _held(record: Array, at: Stretches, quantum: float, chance: float) -> NDArray[np.bool_]:
+    """Which stretches of one value, (k, 2), a sound record that moves as it does on both sides would not have.
+
+    The record moves up to the edges, by more than a step; what begins or ends at rest is let pass.
+    """
+    first, last = at.T
+    steps = np.diff(record)
+    power = np.concatenate([[0.0], np.cumsum(steps**2)])
+    few = np.clip((last - first + 1) // 6, 2, _AROUND)
+    n = steps.size  # those before a stretch end at `first`, those behind it begin at `last`
+
+    def motion(width: Stretches | int) -> Array:
+        start, end = np.maximum(first - width, 0), np.minimum(last + width, n)
+        before, after = (power[first] - power[start]) / width, (power[end] - power[last]) / width
+        return np.sqrt([np.where(first > 0, before, np.inf), np.where(last < n, after, np.inf)])
+
+    near, about = motion(_EDGE), motion(_AROUND)
+    about[:, (first == 0) | (last == n)] = np.sqrt(power[-1] / n)
+    moves = np.all(np.isinf(near) | (near >= np.maximum(_LIVELY * about, _STEPS * quantum)), axis=0)
+    sides = motion(few)
+    sides = np.where(np.isinf(sides), sides[::-1], sides)
+    size = np.maximum(np.sqrt(2 * np.pi * sides[0] * sides[1]), quantum)
+    return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
+
+
+def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool) -> bool:
+    """False of a rest: what stands still at an end of a record with most of the others, or a base that does."""
+    first, last = stretch
+    n = records.shape[1]
+    if first > 0 and last < n - 1:
+        return True
+    if is_base:
+        return False
+    others = np.delete(records, channel, axis=0)
+    within = np.std(np.diff(others[:, first : last + 1]), axis=1)
+    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > _LIVELY)
+
+
+# Spikes: samples that those around them do not predict.
+
+_OUT = 8.0  # times what is not predicted beside them
+_HIT = 5.0  # of the same: other channels that have as much at once say that the structure was hit
+_FOOT = 3  # samples beside a spike that it may reach
+_CLEAR = 16  # samples about stretches that are damaged already, and at the ends, where nothing is judged
+
+
+def _spikes(records: Array, quanta: Array, held: list[Stretches]) -> Iterator[DamagedSamples]:
+    """Samples of one channel that stand out of what all others of it predict.
+
+    An error h of one sample has the estimate ``sum(X / S) / sum(1 / S)``, for a record of the spectrum S (Fox 1972). It
+    is held against its mean beside the sample, and against the record there. Where most channels have such samples at
+    once, the structure was hit.
+    """
+    n = records.shape[1]
+    ramp = np.linspace(0, 1, n)
+    spectra = np.fft.rfft(records - records[:, :1] - (records[:, -1:] - records[:, :1]) * ramp)
+    weight = 1 / _smooth(np.abs(spectra) ** 2)
+    single = np.fft.irfft(spectra * weight, n)
+    # Of two samples that are alike, whose spectrum is 2 cos(w / 2) times that of one.
+    twice = weight * (2 * np.cos(np.linspace(0, np.pi / 2, weight.shape[1]))) ** 2
+    starts = np.arange(0, max(n - _AROUND, 0) + 1, _AROUND)
+    around = np.maximum(_beside(np.abs(records - records.mean(axis=1, keepdims=True)), starts), _OUT * quanta[:, None])
+    largest = np.zeros(len(records))
+    found: list[list[tuple[int, int]]] = [[] for _ in records]
+    for width, (estimate, power) in enumerate(((single, weight), (single + np.roll(single, -1, axis=1), twice)), start=1):
+        height = np.abs(estimate) / np.mean(power, axis=1, keepdims=True)
+        usual = np.sqrt(np.pi / 2) * _beside(height, starts)
+        level = np.maximum(_OUT * usual, around)
+        for channel, block in np.argwhere(np.maximum.reduceat(height, starts, axis=1) > level):
+            end = starts[block + 1] if block + 1 < starts.size else n
+            for at in starts[block] + np.flatnonzero(height[channel, starts[block] : end] > level[channel, block]):
+                reach = height[:, max(at - _FOOT, 0) : at + _FOOT + 1].max(axis=1)
+                others = np.delete(reach < _HIT * usual[:, block], channel)
+                if _CLEAR <= at < n - _CLEAR and np.all(others) and _is_clear(held[channel], at):
+                    found[channel].append((at, at + width - 1))
+                    largest[channel] = max(largest[channel], height[channel, at])
+    for channel, each in enumerate(found):
+        if each:
+            flags = np.zeros(n, dtype=bool)
+            for first, last in each:
+                flags[first : last + 1] = True
+            yield DamagedSamples("spikes", channel, _runs(flags), float(largest[channel]))
+
+
+def _is_clear(held: Stretches, at: int) -> bool:
+    """True of a sample that is not near any stretch."""
+    return not np.any((held[:, 0] - _CLEAR <= at) & (at <= held[:, 1] + _CLEAR))
+
+
+def _smooth(power: Array, parts: int = 256, floor: float = 1e-5) -> Array:
+    """Means of power (channels, lines) over so many bands, at each line; at least `floor` of the mean of all."""
+    width = max(power.shape[1] // parts, 4)
+    starts = np.arange(0, max(power.shape[1] - width, 1), width)
+    sizes = np.diff(np.append(starts, power.shape[1]))
+    means = np.add.reduceat(power, starts, axis=1) / sizes
+    return np.asarray(np.repeat(means + floor * power.mean(axis=1, keepdims=True), sizes, axis=1)) + np.finfo(float).tiny
+
+
+def _beside(size: Array, starts: Stretches) -> Array:
+    """The larger of the means of sizes (channels, n) over the parts before and behind each part, (channels, parts)."""
+    parts = np.diff(np.append(starts, size.shape[1]))
+    mean = np.pad(np.add.reduceat(size, starts, axis=1) / parts, ((0, 0), (1, 1)))
+    return np.asarray(np.maximum(mean[:, :-2], mean[:, 2:]))
+
+
+# Hum: a line of one channel that the other channels do not predict, steady along the record.
+
+_STANDS_OUT = 40.0  # times the median power of what is not predicted about a line
+_ALONE = 15.0  # of the same, that no other channel may have without the one that hums
+_STEADY = 8.0  # power of a steady sine at the lines about it over what it leaves of them
+
+
+def _tones(records: Array, skipped: set[int]) -> Iterator[DamagedSamples]:
+    """Steady sines of single channels, by lines of a windowed record that linear combinations of the others lack."""
+    channels, n = records.shape
+    lines, width = n // 2, max(64, 6 * channels)
+    if channels < 3 or lines < 2 * width:
+        return
+    size = np.std(records, axis=1, keepdims=True)
+    moving = np.where(size > 0, (records - records.mean(axis=1, keepdims=True)) / np.where(size > 0, size, 1.0), 0.0)
+    spectra = np.fft.rfft(moving * np.hanning(n))[:, _FOOT + 1 :]
+    count = spectra.shape[1] // width
+    blocks = np.moveaxis(spectra[:, : count * width].reshape(channels, count, width), 0, 1)
+    times = _power(_unpredicted(blocks))
+    best = times.max(axis=2)
+    for block in np.flatnonzero(np.any(best > _STANDS_OUT, axis=1)):
+        channel = int(np.argmax(best[block]))
+        if channel in skipped:
+            continue
+        line = block * width + int(np.argmax(times[block, channel]))
+        start = min(max(line - width // 2, 0), spectra.shape[1] - width)
+        its, at = spectra[None, :, start : start + width], line - start
+        reach = slice(max(at - _FOOT, 0), at + _FOOT + 1)
+        left = _unpredicted(its, np.delete(its, np.arange(width)[reach], axis=2))[0, channel]
+        others = _power(_unpredicted(np.delete(its, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
+        if others.max() > _ALONE:
+            continue
+        place, steady = _steady(left[reach])
+        if steady > _STEADY:
+            yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), (line + _FOOT + 1 + place) / n)
+
+
+def _unpredicted(blocks: ComplexArray, fitted: ComplexArray | None = None) -> ComplexArray:
+    """What each channel has beside a combination of the others, in blocks of lines (k, channels, lines).
+
+    Combinations are those that leave least in the blocks, or in `fitted`, some of their lines.
+    """
+    lines = blocks if fitted is None else fitted
+    gram = lines @ np.conj(np.swapaxes(lines, 1, 2))
+    floor = 1e-6 * np.einsum("kcc->kc", gram).real + np.finfo(float).tiny
+    inverse = np.linalg.inv(gram + floor[..., None] * np.eye(gram.shape[1]))
+    return np.asarray(inverse @ blocks / np.einsum("kcc->kc", inverse)[..., None])
+
+
+def _power(left: ComplexArray) -> Array:
+    """Power of lines (k, channels, lines) over its median in the block."""
+    power = np.abs(left) ** 2
+    return np.asarray(power / np.maximum(np.median(power, axis=2, keepdims=True) / np.log(2), np.finfo(float).tiny))
+
+
+def _steady(lines: ComplexArray) -> tuple[float, float]:
+    """Place of a steady sine among lines of a Hann window, from the middle one, and its power over what it leaves."""
+    places = np.linspace(-1, 1, 81)
+    at = np.arange(lines.size) - lines.size // 2
+    away = at - places[:, None] + 1e-9  # no zero over zero
+    sines = (-1.0) ** at * np.sinc(away) / (1 - away**2)
+    power = np.abs(sines @ lines) ** 2 / np.sum(sines**2, axis=1)
+    best = int(np.argmax(power))
+    left = max(float(np.sum(np.abs(lines) ** 2) - power[best]), np.finfo(float).tiny)
+    return float(places[best]), float(power[best]) / left
