@@ -231,28 +231,24 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches]) -> Iterator[Da
     once, the structure was hit.
     """
     n = records.shape[1]
-    ramp = np.linspace(0, 1, n)
-    spectra = np.fft.rfft(records - records[:, :1] - (records[:, -1:] - records[:, :1]) * ramp)
-    weight = 1 / _smooth(np.abs(spectra) ** 2)
-    single = np.fft.irfft(spectra * weight, n)
-    # Of two samples that are alike, whose spectrum is 2 cos(w / 2) times that of one.
-    twice = weight * (2 * np.cos(np.linspace(0, np.pi / 2, weight.shape[1]))) ** 2
     starts = np.arange(0, max(n - _AROUND, 0) + 1, _AROUND)
-    around = np.maximum(_beside(np.abs(records - records.mean(axis=1, keepdims=True)), starts), _OUT * quanta[:, None])
-    largest = np.zeros(len(records))
+    ends = np.append(starts[1:], n)
+    heights = [_heights(record) for record in records]
+    usual = np.sqrt(np.pi / 2) * np.array([[_beside(height, starts) for height in both] for both in heights])
     found: list[list[tuple[int, int]]] = [[] for _ in records]
-    for width, (estimate, power) in enumerate(((single, weight), (single + np.roll(single, -1, axis=1), twice)), start=1):
-        height = np.abs(estimate) / np.mean(power, axis=1, keepdims=True)
-        usual = np.sqrt(np.pi / 2) * _beside(height, starts)
-        level = np.maximum(_OUT * usual, around)
-        for channel, block in np.argwhere(np.maximum.reduceat(height, starts, axis=1) > level):
-            end = starts[block + 1] if block + 1 < starts.size else n
-            for at in starts[block] + np.flatnonzero(height[channel, starts[block] : end] > level[channel, block]):
-                reach = height[:, max(at - _FOOT, 0) : at + _FOOT + 1].max(axis=1)
-                others = np.delete(reach < _HIT * usual[:, block], channel)
-                if _CLEAR <= at < n - _CLEAR and np.all(others) and _is_clear(held[channel], at):
-                    found[channel].append((at, at + width - 1))
-                    largest[channel] = max(largest[channel], height[channel, at])
+    largest = np.zeros(len(records))
+    for channel, (record, quantum) in enumerate(zip(records, quanta, strict=True)):
+        around = np.maximum(_beside(np.abs(record - record.mean()), starts), _OUT * quantum)
+        for width, height in enumerate(heights[channel]):
+            level = np.maximum(_OUT * usual[channel, width], around)
+            for block in np.flatnonzero(np.maximum.reduceat(height, starts) > level):
+                start, end = starts[block], ends[block]
+                for at in start + np.flatnonzero(height[start:end] > level[block]):
+                    reach = slice(max(at - _FOOT, 0), at + _FOOT + 1)
+                    hit = [its[width][reach].max() > _HIT * usual[i, width, block] for i, its in enumerate(heights)]
+                    if _CLEAR <= at < n - _CLEAR and sum(hit) == 1 and _is_clear(held[channel], at):
+                        found[channel].append((at, at + width))
+                        largest[channel] = max(largest[channel], height[at])
     for channel, each in enumerate(found):
         if each:
             flags = np.zeros(n, dtype=bool)
@@ -266,20 +262,29 @@ def _is_clear(held: Stretches, at: int) -> bool:
     return not np.any((held[:, 0] - _CLEAR <= at) & (at <= held[:, 1] + _CLEAR))
 
 
-def _smooth(power: Array, parts: int = 256, floor: float = 1e-5) -> Array:
-    """Means of power (channels, lines) over so many bands, at each line; at least `floor` of the mean of all."""
-    width = max(power.shape[1] // parts, 4)
-    starts = np.arange(0, max(power.shape[1] - width, 1), width)
-    sizes = np.diff(np.append(starts, power.shape[1]))
-    means = np.add.reduceat(power, starts, axis=1) / sizes
-    return np.asarray(np.repeat(means + floor * power.mean(axis=1, keepdims=True), sizes, axis=1)) + np.finfo(float).tiny
+def _heights(record: Array) -> tuple[Array, Array]:
+    """Estimates of the size of an error of each sample, and of each two that have the same, (n,)."""
+    n = record.size
+    ramp = record[0] + np.linspace(0, 1, n) * (record[-1] - record[0])
+    spectrum = scipy.fft.rfft(record - ramp)
+    power = np.abs(spectrum) ** 2
+    width = max(power.size // 256, 4)
+    starts = np.arange(0, max(power.size - width, 1), width)
+    sizes = np.diff(np.append(starts, power.size))
+    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes) + np.finfo(float).tiny
+    single = scipy.fft.irfft(spectrum / smooth, n)
+    # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
+    twice = (2 * np.cos(np.linspace(0, np.pi / 2, power.size))) ** 2 / smooth
+    return np.abs(single) / np.mean(1 / smooth), np.abs(single + np.roll(single, -1)) / np.mean(twice)
 
 
 def _beside(size: Array, starts: Stretches) -> Array:
-    """The larger of the means of sizes (channels, n) over the parts before and behind each part, (channels, parts)."""
-    parts = np.diff(np.append(starts, size.shape[1]))
-    mean = np.pad(np.add.reduceat(size, starts, axis=1) / parts, ((0, 0), (1, 1)))
-    return np.asarray(np.maximum(mean[:, :-2], mean[:, 2:]))
+    """The larger of the means of sizes (n,) over the parts before and behind each part, which begin at `starts`.
+
+    Those at the ends have themselves beside them.
+    """
+    mean = np.pad(np.add.reduceat(size, starts) / np.diff(np.append(starts, size.size)), 1, mode="edge")
+    return np.asarray(np.maximum(mean[:-2], mean[2:]))
 
 
 # Hum: a line of one channel that the other channels do not predict, steady along the record.
@@ -297,7 +302,7 @@ def _tones(records: Array, skipped: set[int]) -> Iterator[DamagedSamples]:
         return
     size = np.std(records, axis=1, keepdims=True)
     moving = np.where(size > 0, (records - records.mean(axis=1, keepdims=True)) / np.where(size > 0, size, 1.0), 0.0)
-    spectra = np.fft.rfft(moving * np.hanning(n))[:, _FOOT + 1 :]
+    spectra = scipy.fft.rfft(moving * np.hanning(n))[:, _FOOT + 1 :]
     count = spectra.shape[1] // width
     blocks = np.moveaxis(spectra[:, : count * width].reshape(channels, count, width), 0, 1)
     times = _power(_unpredicted(blocks))
