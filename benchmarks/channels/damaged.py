@@ -7,7 +7,6 @@ low-passed and decimated, noise is added, and all is rounded to the steps of a r
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -11,7 +11,7 @@ alarms for all channels and samples of a run:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -65,20 +65,20 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     list of DamagedSamples
         Channel by channel; the worst of each channel first. None of channels that never move.
     """
-    channels, n = records.shape
-    if n < 2 * _EDGE:
+    if records.shape[1] < 2 * _EDGE:
         return []
     found = list(_equal(records))
     held: list[Stretches] = []
     quanta = [_quantum(record) for record in records]
-    for channel, (record, quantum) in enumerate(zip(records, quanta, strict=True)):
+    for channel, quantum in enumerate(quanta):
         stretches = [np.zeros((0, 2), np.intp)]
         for one in _flat(records, channel, quantum, is_base=channel < n_base):
             found.append(one)
             stretches.append(one.stretches)
         held.append(np.concatenate(stretches))
     found += _spikes(records, np.array(quanta), held)
-    found += _tones(records, {one.channel for one in found})
+    sound = np.delete(np.arange(len(records)), [one.channel for one in found])
+    found += [replace(one, channel=int(sound[one.channel])) for one in _tones(records[sound])]
     return sorted(found, key=lambda one: one.channel)
 
 
@@ -88,17 +88,17 @@ def _equal(records: Array, least: int = 50) -> Iterator[DamagedSamples]:
     for channel in range(1, len(records)):
         for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
             one, its = records[channel], records[other]
-            if np.array_equal(np.abs(one), np.abs(its)) and (np.array_equal(one, its) or np.array_equal(one, -its)):
-                if np.count_nonzero(np.diff(one)) >= least:
-                    yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
-                    break
+            same = np.array_equal(one, its) or np.array_equal(one, -its)
+            if same and np.count_nonzero(np.diff(one)) >= least:
+                yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
+                break
 
 
 # Flat tops and held values.
 
 _EDGE = 8  # samples beside a stretch, by which it is told whether the record moves there
 _AROUND = 64  # of which the motion about a stretch is told
-_LIVELY = 0.25  # of the motion about a stretch: what moves as much up to its edge does not come to rest there
+_LIVELY = 0.12  # of the motion about a stretch: what moves as much up to its edge does not come to rest there
 _STEPS = 1.5  # of a recorder, by which a record moves up to the edges of a stretch
 _NEAREST = 8  # different values next to an extreme one, that tell how densely values lie there
 _MORE = 1.5  # times what they tell, that noise may add
@@ -116,23 +116,24 @@ def _quantum(record: Array) -> float:
 def _runs(flags: NDArray[np.bool_]) -> Stretches:
     """First and last of each run of true flags, (k, 2)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
-    return edges.reshape(-1, 2) - [0, 1]
+    return np.column_stack([edges[::2], edges[1::2] - 1])
 
 
 def _flat(records: Array, channel: int, quantum: float, *, is_base: bool) -> Iterator[DamagedSamples]:
     """Flat tops, then gaps, then held values of a channel."""
     record = records[channel]
     tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
-    tops = [np.zeros((0, 2), np.intp)]
-    for sign in (1, -1):
-        at = _runs(sign * record >= np.max(sign * record) - tolerance)
-        is_gap = len(at) == 1 and abs(record[at[0, 0]]) <= tolerance
-        if not is_gap and _log_chance_of_tops(sign * record, at, quantum) < chance:
-            tops.append(at)
-    clipped = np.concatenate(tops)
+    ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
+    logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
+    if abs(record.max() + record.min()) < quantum:  # of one range
+        logs = [sum(logs)] * 2
+    is_gap = [len(at) == 1 and abs(record[at[0, 0]]) <= tolerance for at in ends]
+    tops = [at for at, log, gap in zip(ends, logs, is_gap, strict=True) if log < chance and not gap]
+    clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
     if len(clipped):
         yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
-    at = _runs(np.abs(np.diff(record)) <= tolerance) + [0, 1]
+    at = _runs(np.abs(np.diff(record)) <= tolerance)  # of differences: a stretch has one sample more
+    at[:, 1] += 1
     at = at[at[:, 1] - at[:, 0] > 1]
     if len(clipped):
         at = at[~np.isin(at[:, 0], clipped[:, 0])]
@@ -294,7 +295,7 @@ _ALONE = 15.0  # of the same, that no other channel may have without the one tha
 _STEADY = 8.0  # power of a steady sine at the lines about it over what it leaves of them
 
 
-def _tones(records: Array, skipped: set[int]) -> Iterator[DamagedSamples]:
+def _tones(records: Array) -> Iterator[DamagedSamples]:
     """Steady sines of single channels, by lines of a windowed record that linear combinations of the others lack."""
     channels, n = records.shape
     lines, width = n // 2, max(64, 6 * channels)
@@ -306,22 +307,27 @@ def _tones(records: Array, skipped: set[int]) -> Iterator[DamagedSamples]:
     count = spectra.shape[1] // width
     blocks = np.moveaxis(spectra[:, : count * width].reshape(channels, count, width), 0, 1)
     times = _power(_unpredicted(blocks))
-    best = times.max(axis=2)
+    best, told = times.max(axis=2), set()
     for block in np.flatnonzero(np.any(best > _STANDS_OUT, axis=1)):
         channel = int(np.argmax(best[block]))
-        if channel in skipped:
-            continue
-        line = block * width + int(np.argmax(times[block, channel]))
-        start = min(max(line - width // 2, 0), spectra.shape[1] - width)
-        its, at = spectra[None, :, start : start + width], line - start
-        reach = slice(max(at - _FOOT, 0), at + _FOOT + 1)
-        left = _unpredicted(its, np.delete(its, np.arange(width)[reach], axis=2))[0, channel]
-        others = _power(_unpredicted(np.delete(its, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
-        if others.max() > _ALONE:
-            continue
-        place, steady = _steady(left[reach])
-        if steady > _STEADY:
-            yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), (line + _FOOT + 1 + place) / n)
+        start = block * width + int(np.argmax(times[block, channel])) - width // 2
+        start = min(max(start, 0), spectra.shape[1] - width)
+        at, place, alone = _tone_at(spectra[:, start : start + width], channel)
+        line = start + at + _FOOT + 1 + place
+        if alone and (channel, round(line)) not in told:
+            told.add((channel, round(line)))
+            yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), line / n)
+
+
+def _tone_at(lines: ComplexArray, channel: int) -> tuple[int, float, bool]:
+    """Line of a tone of a channel among lines (channels, k), its place from there, and whether it is one, and alone."""
+    blocks = lines[None]
+    at = int(np.argmax(np.abs(_unpredicted(blocks)[0, channel])))
+    reach = np.arange(max(at - _FOOT, 0), min(at + _FOOT + 1, lines.shape[1]))
+    left = _unpredicted(blocks, np.delete(blocks, reach, axis=2))[0, channel]
+    place, steady = _steady(left[reach], reach - at)
+    others = _power(_unpredicted(np.delete(blocks, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
+    return at, place, bool(steady > _STEADY and others.max() < _ALONE)
 
 
 def _unpredicted(blocks: ComplexArray, fitted: ComplexArray | None = None) -> ComplexArray:
@@ -342,10 +348,9 @@ def _power(left: ComplexArray) -> Array:
     return np.asarray(power / np.maximum(np.median(power, axis=2, keepdims=True) / np.log(2), np.finfo(float).tiny))
 
 
-def _steady(lines: ComplexArray) -> tuple[float, float]:
-    """Place of a steady sine among lines of a Hann window, from the middle one, and its power over what it leaves."""
+def _steady(lines: ComplexArray, at: Stretches) -> tuple[float, float]:
+    """Place of a steady sine among lines of a Hann window at whole places, and its power over what it leaves."""
     places = np.linspace(-1, 1, 81)
-    at = np.arange(lines.size) - lines.size // 2
     away = at - places[:, None] + 1e-9  # no zero over zero
     sines = (-1.0) ** at * np.sinc(away) / (1 - away**2)
     power = np.abs(sines @ lines) ** 2 / np.sum(sines**2, axis=1)

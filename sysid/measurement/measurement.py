@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any, Literal
 
@@ -23,7 +23,8 @@ from sysid.errors import (
     whole_number,
 )
 from sysid.measurement import spectra
-from sysid.measurement.spectra import Missing, complete, named, present
+from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
+from sysid.measurement.spectra import Missing, checked_deviations, checked_lines, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -73,6 +74,8 @@ class Measurement:
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
     sample_rate : float, optional
         Hz; of the plain spectra of whole records, in m/s² s, that `from_time` gives with the estimator "spectra".
+    damage : tuple of DamagedChannel
+        Damaged samples of the records of which `from_time` makes it.
 
     Notes
     -----
@@ -95,6 +98,7 @@ class Measurement:
     averaged: bool = field(default=False, kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     sample_rate: float | None = field(default=None, kw_only=True)
+    damage: tuple[DamagedChannel, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -108,12 +112,12 @@ class Measurement:
             put("dropped", self.dropped + self.freq.size - there["freq"].size)
             for name, record in there.items():
                 put(name, record)
-        put("base", _records("base", self.base, self.freq.size))
-        put("response", _records("response", self.response, self.freq.size))
+        put("base", checked_lines("base", self.base, self.freq.size))
+        put("response", checked_lines("response", self.response, self.freq.size))
         put("rigid_body", motion_of_sensors(self.rigid_body, self.sensors, self.base_axes, self.base.shape[1]))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
         if self.force is not None:
-            put("force", _records("force", self.force, self.freq.size))
+            put("force", checked_lines("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
                 raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
         put("sensors", checked_sensors(self.sensors))
@@ -133,8 +137,8 @@ class Measurement:
         )
         put("base_axes", axes_of_base(self.base_axes, self.sensors or (), self.rigid_body))
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
-        put("response_std", _std("response_std", self.response_std, self.response))
-        put("force_std", _std("force_std", self.force_std, self.force))
+        put("response_std", checked_deviations("response_std", self.response_std, self.response))
+        put("force_std", checked_deviations("force_std", self.force_std, self.force))
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -144,7 +148,7 @@ class Measurement:
             "force_std": self.force_std, "base_axes": self.base_axes,
             "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
             "averaged": self.averaged, "whole": self.whole and self.whole.to_tree(),
-            "sample_rate": self.sample_rate,
+            "sample_rate": self.sample_rate, "damage": [one.to_tree() for one in self.damage],
         }  # fmt: skip
 
     @classmethod
@@ -152,7 +156,9 @@ class Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole})
+        damage = tuple(map(DamagedChannel.from_tree, tree["damage"]))
+        given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
+        return cls(**{**tree, **given})
 
     @property
     def translational(self) -> NDArray[np.bool_]:
@@ -323,12 +329,17 @@ class Measurement:
         choice("missing", missing, ("refuse", "drop"))
         read = numbers if missing == "drop" else complete  # lines with NaN go where the records have all runs
         H = read("frf", frf, complex)
-        H = _records("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
+        H = checked_lines("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
         d = H.shape[1]
-        F = None if force is None else _records("force", force, lines.size, read)
+        F = None if force is None else checked_lines("force", force, lines.size, read)
         if F is not None and F.shape != (d, d, lines.size):
             raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}")
-        given = H, F, _std("response_std", response_std, H, read), _std("force_std", force_std, F, read)
+        given = (
+            H,
+            F,
+            checked_deviations("response_std", response_std, H, read),
+            checked_deviations("force_std", force_std, F, read),
+        )
         # The base direction comes first: it becomes the run.
         by_run: Any = [None if record is None else np.moveaxis(record, 1, 0) for record in given]
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
@@ -393,11 +404,14 @@ class Measurement:
         check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
         G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
-        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
+        names = names_of_channels(checked_sensors(sensors), G, base_axes)
+        sound = sound_runs(records, float(sample_rate), names, cut=estimator == "records")
+        records = sound.runs
+        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes, "damage": sound.damage}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             if estimator == "records":
-                given["whole"] = whole_of(records, float(sample_rate), at_rest, noise, G)
+                given["whole"] = whole_of(records, float(sample_rate), sound.rests(at_rest), sound.levels(noise), G)
             else:
                 given["sample_rate"] = float(sample_rate)
             test = cls(freq, base, response, force=force, **given)
@@ -418,30 +432,6 @@ class Measurement:
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
     """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
-
-
-def _records(name: str, value: Any, n_freq: int, read: Callable[..., Any] = complete) -> ComplexArray:
-    array: ComplexArray = read(name, value, complex)
-    if array.ndim == 2:
-        array = array[None]
-    if array.ndim != 3 or array.shape[-1] != n_freq:
-        raise InputError(f"{name} has shape {array.shape}; (runs, channels, {n_freq}) is needed, frequency last")
-    return array
-
-
-def _std(name: str, value: Any, record: ComplexArray | None, read: Callable[..., Any] = complete) -> Array | None:
-    if value is None:
-        return None
-    if record is None:
-        raise InputError(f"{name} is given without its record")
-    array = read(name, value)
-    try:
-        full = np.broadcast_to(array, record.shape).copy()
-    except ValueError:
-        raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
-    if np.any(full < 0):
-        raise InputError(f"{name} holds negative entries")
-    return full
 
 
 def simulate(
