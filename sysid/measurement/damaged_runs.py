@@ -159,7 +159,7 @@ def _refuse_equal(found: Sequence[DamagedSamples], names: Sequence[str], where: 
     if pairs:
         words = "; ".join(f"{a} and {b} hold the same samples{where}" for a, b in pairs[:3])
         raise InputError(
-            f"{words}, up to the sign: one record stands in two places; read the right one, or leave it out"
+            f"{words}: one record stands in two places; read the right one, or leave it out"
         )
 
 

@@ -67,7 +67,7 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     """
     if records.shape[1] < 2 * _EDGE:
         return []
-    found = list(_equal(records))
+    found = list(_equal(records, n_base))
     held: list[Stretches] = []
     quanta = [_quantum(record) for record in records]
     for channel, quantum in enumerate(quanta):
@@ -82,14 +82,16 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     return sorted(found, key=lambda one: one.channel)
 
 
-def _equal(records: Array, least: int = 50) -> Iterator[DamagedSamples]:
-    """Channels with the same samples as one before, or with their negatives, that change `least` times at least."""
+def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamples]:
+    """Channels with the same samples as one before, that change `least` times at least.
+
+    A base may move along two of its axes alike.
+    """
     sizes = np.sum(np.abs(records), axis=1)
-    for channel in range(1, len(records)):
+    for channel in range(max(n_base, 1), len(records)):
         for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
-            one, its = records[channel], records[other]
-            same = np.array_equal(one, its) or np.array_equal(one, -its)
-            if same and np.count_nonzero(np.diff(one)) >= least:
+            one = records[channel]
+            if np.array_equal(one, records[other]) and np.count_nonzero(np.diff(one)) >= least:
                 yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
                 break
 
@@ -122,6 +124,8 @@ def _runs(flags: NDArray[np.bool_]) -> Stretches:
 def _flat(records: Array, channel: int, quantum: float, *, is_base: bool) -> Iterator[DamagedSamples]:
     """Flat tops, then gaps, then held values of a channel."""
     record = records[channel]
+    if quantum == 0.0:  # it is zero all along
+        return
     tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
     ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
     logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
@@ -269,10 +273,12 @@ def _heights(record: Array) -> tuple[Array, Array]:
     ramp = record[0] + np.linspace(0, 1, n) * (record[-1] - record[0])
     spectrum = scipy.fft.rfft(record - ramp)
     power = np.abs(spectrum) ** 2
+    if not np.any(power > np.finfo(float).tiny):
+        return np.zeros(n), np.zeros(n)
     width = max(power.size // 256, 4)
     starts = np.arange(0, max(power.size - width, 1), width)
     sizes = np.diff(np.append(starts, power.size))
-    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes) + np.finfo(float).tiny
+    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes)
     single = scipy.fft.irfft(spectrum / smooth, n)
     # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
     twice = (2 * np.cos(np.linspace(0, np.pi / 2, power.size))) ** 2 / smooth

@@ -407,21 +407,21 @@ class Measurement:
         names = names_of_channels(checked_sensors(sensors), G, base_axes)
         sound = sound_runs(records, float(sample_rate), names, cut=estimator == "records")
         records = sound.runs
-        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes, "damage": sound.damage}
+        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             if estimator == "records":
                 given["whole"] = whole_of(records, float(sample_rate), sound.rests(at_rest), sound.levels(noise), G)
             else:
                 given["sample_rate"] = float(sample_rate)
-            test = cls(freq, base, response, force=force, **given)
+            test = cls(freq, base, response, force=force, damage=sound.damage, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
-            test = replace(test, averaged=True)
+            test = replace(test, averaged=True, damage=sound.damage)
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
