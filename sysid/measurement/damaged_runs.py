@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,10 @@ _MADE_BY = {
     "held value": "hold one value, {value:.4g}, while the other channels move",
     "spikes": "stand out of those around them, by up to {value:.4g}: spikes",
 }
-REMEDY = "leave this channel out, cut the record there, or record it anew"
+_REMEDIES = {
+    "tone": "it stays in the records: find its source, such as the mains or a fan, or leave this channel out",
+    "equal channels": "read the right one, or leave this channel out",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class DamagedChannel:
     Attributes
     ----------
     kind : str
-        "clipped", "dropout", "held value", "spikes" or "tone".
+        "clipped", "dropout", "held value", "spikes", "tone" or "equal channels".
     run : int
         From 1, of the runs that were given.
     channel : str
@@ -45,6 +48,8 @@ class DamagedChannel:
         Samples that are damaged, and of the run.
     value : float
         As in `DamagedSamples`; of a tone Hz.
+    other : str
+        The channel with the same samples.
     left_out : bool
         True where the run was cut there.
     """
@@ -56,18 +61,38 @@ class DamagedChannel:
     count: int
     samples: int
     value: float
+    other: str = ""
     left_out: bool = False
+
+    @property
+    def is_local(self) -> bool:
+        """True of damage in some places, between which a run may be cut."""
+        return self.kind not in ("tone", "equal channels")
+
+    @property
+    def is_long(self) -> bool:
+        """True of damage with which nothing is identified where it is not left out."""
+        return self.kind == "equal channels" or (self.is_local and self.count > _LONG * self.samples)
 
     @property
     def sentence(self) -> str:
         """Channel, place, count and kind in words."""
         if self.kind == "tone":
             return f"{self.channel} hums at {self.value:.5g} Hz all along: a steady tone that no other channel has"
+        if self.kind == "equal channels":
+            return f"{self.channel} holds the same samples as {self.other}: one record stands in two places"
         first, last = self.stretches[0, 0], self.stretches[-1, 1]
         share = f"{self.count} of {self.samples} samples ({100 * self.count / self.samples:.2g} %)"
         several = f" in {len(self.stretches)} places" if len(self.stretches) > 1 else ""
         made_by = _MADE_BY[self.kind].format(value=self.value)
         return f"{self.channel} is damaged: {share}{several} from {first:.5g} to {last:.5g} s {made_by}"
+
+    @property
+    def remedy(self) -> str:
+        """What was done about it, or is to be done."""
+        if self.left_out:
+            return "the run is cut there, and what is damaged left out"
+        return _REMEDIES.get(self.kind, "leave this channel out, cut the record there, or record it anew")
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""
@@ -89,27 +114,34 @@ class SoundRuns:
         Those with short damage are cut in pieces.
     damage : tuple of DamagedChannel
     source : tuple of int
-        Of which run, from 0, each is a piece.
+        Of which run, from 0, each is a piece, or all.
+    cut : tuple of bool
+        Which of the runs that were given are cut.
     """
 
     runs: list[TimeRun]
     damage: tuple[DamagedChannel, ...]
     source: tuple[int, ...]
+    cut: tuple[bool, ...]
 
     def rests(self, at_rest: Any) -> Any:
         """Which runs begin and end at rest, of those given: pieces do not."""
-        if isinstance(at_rest, bool | np.bool_):
-            at_rest = [bool(at_rest)] * len(set(self.source))
-        if len(self.source) == len(set(self.source)) or np.shape(at_rest) != (len(set(self.source)),):
+        if not any(self.cut):
             return at_rest
-        return [at_rest[run] if self.source.count(run) == 1 else False for run in self.source]
+        each = [at_rest] * len(self.cut) if isinstance(at_rest, bool | np.bool_) else at_rest
+        if np.shape(each) != (len(self.cut),):
+            return at_rest  # which is refused
+        return [False if self.cut[run] else each[run] for run in self.source]
 
     def levels(self, noise: NoiseLevels | None) -> NoiseLevels | None:
         """Levels of noise of each run, of those of the runs that were given."""
-        if noise is None or noise.base.ndim == 1 or len(noise.base) != len(set(self.source)):
+        if noise is None or not any(self.cut):
             return noise
-        rows = {name: part[list(self.source)] for name, part in vars(noise).items() if part is not None}
-        return NoiseLevels(**rows)
+        levels = {name: part for name, part in vars(noise).items() if part is not None}
+        by_run = {name for name, part in levels.items() if part.ndim == 2 and len(part) == len(self.cut)}
+        return NoiseLevels(**{
+            name: part[list(self.source)] if name in by_run else part for name, part in levels.items()
+        })  # fmt: skip
 
 
 def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cut: bool) -> SoundRuns:
@@ -131,49 +163,47 @@ def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cu
         Two channels are equal; damage of more than a hundredth of a channel's samples cannot be left out.
     """
     taken: list[TimeRun] = []
-    told: list[DamagedChannel] = []
     source: list[int] = []
+    cuts: list[bool] = []
+    damage = damage_of_runs(runs, rate, names)
     for index, run in enumerate(runs):
-        records = np.vstack([run.base, run.outputs])
-        found = damaged_samples(records, len(run.base))
-        where = of_run(index, len(runs))
-        _refuse_equal(found, names, where)
-        pieces = _pieces(found, records.shape[1]) if cut else []
-        damage = [_told(one, names, index, rate, records.shape[1], bool(pieces)) for one in found]
-        long = [one for one in damage if one.count > _LONG * one.samples and not one.left_out and one.kind != "tone"]
-        if long:
-            raise InputError("; ".join(f"the record{where} of {one.sentence}: {REMEDY}" for one in long[:3]))
+        its = [one for one in damage if one.run == index + 1]
+        pieces = _pieces(its, rate, run.base.shape[1]) if cut else []
+        cuts.append(bool(pieces))
         parts = [
             TimeRun(run.base[:, a:b], run.response[:, a:b], None if run.force is None else run.force[:, a:b])
             for a, b in pieces
         ]
         taken += parts or [run]
-        told += damage
         source += [index] * max(len(parts), 1)
-    return SoundRuns(taken, tuple(told), tuple(source))
-
-
-def _refuse_equal(found: Sequence[DamagedSamples], names: Sequence[str], where: str) -> None:
-    """Refuse channels that hold the same samples."""
-    pairs = [(names[int(one.value)], names[one.channel]) for one in found if one.kind == "equal channels"]
-    if pairs:
-        words = "; ".join(f"{a} and {b} hold the same samples{where}" for a, b in pairs[:3])
+    told = tuple(replace(one, left_out=one.is_local and cuts[one.run - 1]) for one in damage)
+    refused = [one for one in told if one.is_long and not one.left_out]
+    if refused:
         raise InputError(
-            f"{words}: one record stands in two places; read the right one, or leave it out"
+            "; ".join(f"{one.sentence}{of_run(one.run - 1, len(runs))}; {one.remedy}" for one in refused[:3])
         )
+    return SoundRuns(taken, told, tuple(source), tuple(cuts))
 
 
-def _told(one: DamagedSamples, names: Sequence[str], run: int, rate: float, samples: int, cut: bool) -> DamagedChannel:
-    tone = one.kind == "tone"
-    value = one.value * rate if tone else one.value
-    return DamagedChannel(
-        one.kind, run + 1, names[one.channel], one.stretches / rate, one.count, samples, value, cut and not tone
-    )
+def damage_of_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str]) -> list[DamagedChannel]:
+    """Damage of the runs of a test, at `rate` Hz, with the names of base, sensors and force."""
+    return [
+        _told(one, names, run, number, rate)
+        for number, run in enumerate(runs, start=1)
+        for one in damaged_samples(np.vstack([run.base, run.outputs]), len(run.base))
+    ]
 
 
-def _pieces(found: Sequence[DamagedSamples], samples: int) -> list[tuple[int, int]]:
+def _told(one: DamagedSamples, names: Sequence[str], run: TimeRun, number: int, rate: float) -> DamagedChannel:
+    value = one.value * rate if one.kind == "tone" else one.value
+    other = names[int(one.value)] if one.kind == "equal channels" else ""
+    samples = run.base.shape[1]
+    return DamagedChannel(one.kind, number, names[one.channel], one.stretches / rate, one.count, samples, value, other)
+
+
+def _pieces(damage: Sequence[DamagedChannel], rate: float, samples: int) -> list[tuple[int, int]]:
     """First sample, and that after the last, of pieces between what is damaged; none where too little would be left."""
-    stretches = [one.stretches for one in found if one.kind not in ("tone", "equal channels")]
+    stretches = [np.round(one.stretches * rate).astype(int) for one in damage if one.is_local]
     if not stretches:
         return []
     at = np.concatenate(stretches)

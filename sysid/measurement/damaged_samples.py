@@ -224,42 +224,70 @@ def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool
 
 _OUT = 8.0  # times what is not predicted beside them
 _HIT = 5.0  # of the same: other channels that have as much at once say that the structure was hit
+_TOP = 0.75  # of the highest estimate about a sample
 _FOOT = 3  # samples beside a spike that it may reach
 _CLEAR = 16  # samples about stretches that are damaged already, and at the ends, where nothing is judged
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Estimates of errors of one sample, and of two that have the same, beside what they usually are.
+
+    An error h of the samples of a spectrum D has the estimate ``sum(D* X / S) / sum(|D|² / S)`` in a record X of the
+    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, (channels, 2,
+    parts), and `around` the size of the record there, (channels, parts).
+    """
+
+    heights: Array
+    usual: Array
+    around: Array
+    parts: Stretches
+
+    @classmethod
+    def of(cls, records: Array, quanta: Array) -> _Errors:
+        n = records.shape[1]
+        parts = np.append(np.arange(0, max(n - _AROUND, 0) + 1, _AROUND), n)
+        heights = np.array([_heights(record) for record in records])
+        usual = np.sqrt(np.pi / 2) * np.array([[_beside(its, parts) for its in both] for both in heights])
+        around = np.array([_beside(np.abs(record - record.mean()), parts) for record in records])
+        return cls(heights, usual, np.maximum(around, _OUT * quanta[:, None]), parts)
+
+    def candidates(self, channel: int) -> Iterator[tuple[int, int, int]]:
+        """First and last sample, and the part, of all that stand out in a channel."""
+        for more, height in enumerate(self.heights[channel]):
+            level = np.maximum(_OUT * self.usual[channel, more], self.around[channel])
+            for part in np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level):
+                start, end = self.parts[part : part + 2]
+                for at in start + np.flatnonzero(height[start:end] > level[part]):
+                    yield int(at), int(at + more), int(part)
+
+    def is_spike(self, channel: int, first: int, last: int, part: int) -> bool:
+        """True of the highest there, of as many samples as stand out most, where no other channel stands out."""
+        reach = slice(max(first - _FOOT, 0), first + _FOOT + 1)
+        tops = self.heights[:, :, reach].max(axis=2)
+        times = tops / np.maximum(self.usual[:, :, part], np.finfo(float).tiny)
+        own, more = times[channel], last - first
+        highest = self.heights[channel, more, first] > _TOP * tops[channel, more]
+        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > _HIT) == 1)
 
 
 def _spikes(records: Array, quanta: Array, held: list[Stretches]) -> Iterator[DamagedSamples]:
     """Samples of one channel that stand out of what all others of it predict.
 
-    An error h of one sample has the estimate ``sum(X / S) / sum(1 / S)``, for a record of the spectrum S (Fox 1972). It
-    is held against its mean beside the sample, and against the record there. Where most channels have such samples at
-    once, the structure was hit.
+    They are held against what is usual beside them, and against the record there. Where other channels have such
+    samples at once, the structure was hit.
     """
     n = records.shape[1]
-    starts = np.arange(0, max(n - _AROUND, 0) + 1, _AROUND)
-    ends = np.append(starts[1:], n)
-    heights = [_heights(record) for record in records]
-    usual = np.sqrt(np.pi / 2) * np.array([[_beside(height, starts) for height in both] for both in heights])
-    found: list[list[tuple[int, int]]] = [[] for _ in records]
-    largest = np.zeros(len(records))
-    for channel, (record, quantum) in enumerate(zip(records, quanta, strict=True)):
-        around = np.maximum(_beside(np.abs(record - record.mean()), starts), _OUT * quantum)
-        for width, height in enumerate(heights[channel]):
-            level = np.maximum(_OUT * usual[channel, width], around)
-            for block in np.flatnonzero(np.maximum.reduceat(height, starts) > level):
-                start, end = starts[block], ends[block]
-                for at in start + np.flatnonzero(height[start:end] > level[block]):
-                    reach = slice(max(at - _FOOT, 0), at + _FOOT + 1)
-                    hit = [its[width][reach].max() > _HIT * usual[i, width, block] for i, its in enumerate(heights)]
-                    if _CLEAR <= at < n - _CLEAR and sum(hit) == 1 and _is_clear(held[channel], at):
-                        found[channel].append((at, at + width))
-                        largest[channel] = max(largest[channel], height[at])
-    for channel, each in enumerate(found):
-        if each:
-            flags = np.zeros(n, dtype=bool)
-            for first, last in each:
+    errors = _Errors.of(records, quanta)
+    for channel in range(len(records)):
+        flags = np.zeros(n, dtype=bool)
+        for first, last, part in errors.candidates(channel):
+            clear = _CLEAR <= first < n - _CLEAR and _is_clear(held[channel], first)
+            if clear and errors.is_spike(channel, first, last, part):
                 flags[first : last + 1] = True
-            yield DamagedSamples("spikes", channel, _runs(flags), float(largest[channel]))
+        if np.any(flags):
+            size = errors.heights[channel].max(axis=0)
+            yield DamagedSamples("spikes", channel, _runs(flags), float(size[flags].max()))
 
 
 def _is_clear(held: Stretches, at: int) -> bool:
@@ -285,12 +313,12 @@ def _heights(record: Array) -> tuple[Array, Array]:
     return np.abs(single) / np.mean(1 / smooth), np.abs(single + np.roll(single, -1)) / np.mean(twice)
 
 
-def _beside(size: Array, starts: Stretches) -> Array:
-    """The larger of the means of sizes (n,) over the parts before and behind each part, which begin at `starts`.
+def _beside(size: Array, parts: Stretches) -> Array:
+    """The larger of the means of sizes (n,) over the parts before and behind each part, whose edges are `parts`.
 
     Those at the ends have themselves beside them.
     """
-    mean = np.pad(np.add.reduceat(size, starts) / np.diff(np.append(starts, size.size)), 1, mode="edge")
+    mean = np.pad(np.add.reduceat(size, parts[:-1]) / np.diff(parts), 1, mode="edge")
     return np.asarray(np.maximum(mean[:-2], mean[2:]))
 
 
