@@ -326,6 +326,7 @@ def _beside(size: Array, parts: Stretches) -> Array:
 
 _STANDS_OUT = 40.0  # times the median power of what is not predicted about a line
 _ALONE = 15.0  # of the same, that no other channel may have without the one that hums
+_LOUD = 0.01  # amplitude of hum over a channel's rms: less is what steps make of a sine
 _STEADY = 8.0  # power of a steady sine at the lines about it over what it leaves of them
 
 
@@ -346,22 +347,23 @@ def _tones(records: Array) -> Iterator[DamagedSamples]:
         channel = int(np.argmax(best[block]))
         start = block * width + int(np.argmax(times[block, channel])) - width // 2
         start = min(max(start, 0), spectra.shape[1] - width)
-        at, place, alone = _tone_at(spectra[:, start : start + width], channel)
+        at, place, alone = _tone_at(spectra[:, start : start + width], channel, n)
         line = start + at + _FOOT + 1 + place
         if alone and (channel, round(line)) not in told:
             told.add((channel, round(line)))
             yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), line / n)
 
 
-def _tone_at(lines: ComplexArray, channel: int) -> tuple[int, float, bool]:
+def _tone_at(lines: ComplexArray, channel: int, samples: int) -> tuple[int, float, bool]:
     """Line of a tone of a channel among lines (channels, k), its place from there, and whether it is one, and alone."""
     blocks = lines[None]
     at = int(np.argmax(np.abs(_unpredicted(blocks)[0, channel])))
     reach = np.arange(max(at - _FOOT, 0), min(at + _FOOT + 1, lines.shape[1]))
     left = _unpredicted(blocks, np.delete(blocks, reach, axis=2))[0, channel]
     place, steady = _steady(left[reach], reach - at)
+    loud = np.abs(left[at]) > _LOUD * samples / 4  # a Hann window's peak of a sine of this amplitude
     others = _power(_unpredicted(np.delete(blocks, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
-    return at, place, bool(steady > _STEADY and others.max() < _ALONE)
+    return at, place, bool(loud and steady > _STEADY and others.max() < _ALONE)
 
 
 def _unpredicted(blocks: ComplexArray, fitted: ComplexArray | None = None) -> ComplexArray:
