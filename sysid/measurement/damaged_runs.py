@@ -15,10 +15,6 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.structure.sensor import Sensor, axes_of_base
 from sysid.structure.structure import Array
 
-_LONG = 0.01  # of a channel's samples: at 2.6 deviations of a Gaussian record flat tops take off 4 % of its rms
-_PIECE = 0.1  # of a run, that a piece of it holds at least
-_KEPT = 0.75  # of a run, that its pieces hold at least together
-
 _MADE_BY = {
     "clipped": "hold its largest value, {value:.4g}: a range that was too small",
     "dropout": "are zero while the other channels move: a gap",
@@ -69,10 +65,12 @@ class DamagedChannel:
         """True of damage in some places, between which a run may be cut."""
         return self.kind not in ("tone", "equal channels")
 
-    @property
-    def is_long(self) -> bool:
-        """True of damage with which nothing is identified where it is not left out."""
-        return self.kind == "equal channels" or (self.is_local and self.count > _LONG * self.samples)
+    def is_long(self, share: float = 0.01) -> bool:
+        """True of damage with which nothing is identified where it is not left out: this share of a channel's samples.
+
+        Flat tops of so many samples, at 2.6 deviations of a Gaussian record, take 4 % of its rms.
+        """
+        return self.kind == "equal channels" or (self.is_local and self.count > share * self.samples)
 
     @property
     def sentence(self) -> str:
@@ -177,7 +175,7 @@ def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cu
         taken += parts or [run]
         source += [index] * max(len(parts), 1)
     told = tuple(replace(one, left_out=one.is_local and cuts[one.run - 1]) for one in damage)
-    refused = [one for one in told if one.is_long and not one.left_out]
+    refused = [one for one in told if one.is_long() and not one.left_out]
     if refused:
         raise InputError(
             "; ".join(f"{one.sentence}{of_run(one.run - 1, len(runs))}; {one.remedy}" for one in refused[:3])
@@ -201,8 +199,13 @@ def _told(one: DamagedSamples, names: Sequence[str], run: TimeRun, number: int, 
     return DamagedChannel(one.kind, number, names[one.channel], one.stretches / rate, one.count, samples, value, other)
 
 
-def _pieces(damage: Sequence[DamagedChannel], rate: float, samples: int) -> list[tuple[int, int]]:
-    """First sample, and that after the last, of pieces between what is damaged; none where too little would be left."""
+def _pieces(
+    damage: Sequence[DamagedChannel], rate: float, samples: int, piece: float = 0.1, kept: float = 0.75
+) -> list[tuple[int, int]]:
+    """First sample, and that after the last, of pieces between what is damaged; none where too little would be left.
+
+    A `piece` has such a share of the run at least, and all together what is `kept`.
+    """
     stretches = [np.round(one.stretches * rate).astype(int) for one in damage if one.is_local]
     if not stretches:
         return []
@@ -211,9 +214,9 @@ def _pieces(damage: Sequence[DamagedChannel], rate: float, samples: int) -> list
     np.add.at(bad, at[:, 0], 1)
     np.add.at(bad, at[:, 1] + 1, -1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], np.cumsum(bad)[:-1] == 0, [False]]))).reshape(-1, 2)
-    kept = edges[edges[:, 1] - edges[:, 0] >= _PIECE * samples]
-    enough = np.sum(kept[:, 1] - kept[:, 0]) >= _KEPT * samples
-    return [(int(a), int(b)) for a, b in kept] if enough else []
+    long = edges[edges[:, 1] - edges[:, 0] >= piece * samples]
+    enough = np.sum(long[:, 1] - long[:, 0]) >= kept * samples
+    return [(int(a), int(b)) for a, b in long] if enough else []
 
 
 def names_of_channels(

@@ -65,7 +65,7 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     list of DamagedSamples
         Channel by channel; the worst of each channel first. None of channels that never move.
     """
-    if records.shape[1] < 2 * _EDGE:
+    if records.shape[1] < _AROUND:
         return []
     found = list(_equal(records, n_base))
     held: list[Stretches] = []
@@ -98,12 +98,7 @@ def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamp
 
 # Flat tops and held values.
 
-_EDGE = 8  # samples beside a stretch, by which it is told whether the record moves there
-_AROUND = 64  # of which the motion about a stretch is told
-_LIVELY = 0.12  # of the motion about a stretch: what moves as much up to its edge does not come to rest there
-_STEPS = 1.5  # of a recorder, by which a record moves up to the edges of a stretch
-_NEAREST = 8  # different values next to an extreme one, that tell how densely values lie there
-_MORE = 1.5  # times what they tell, that noise may add
+_AROUND = 64  # samples on either side, of which what is usual about others is told
 
 
 def _quantum(record: Array) -> float:
@@ -121,7 +116,9 @@ def _runs(flags: NDArray[np.bool_]) -> Stretches:
     return np.column_stack([edges[::2], edges[1::2] - 1])
 
 
-def _flat(records: Array, channel: int, quantum: float, *, is_base: bool) -> Iterator[DamagedSamples]:
+def _flat(
+    records: Array, channel: int, quantum: float, *, is_base: bool, lively: float = 0.12
+) -> Iterator[DamagedSamples]:
     """Flat tops, then gaps, then held values of a channel."""
     record = records[channel]
     if quantum == 0.0:  # it is zero all along
@@ -141,8 +138,8 @@ def _flat(records: Array, channel: int, quantum: float, *, is_base: bool) -> Ite
     at = at[at[:, 1] - at[:, 0] > 1]
     if len(clipped):
         at = at[~np.isin(at[:, 0], clipped[:, 0])]
-    at = at[_held(record, at, quantum, FALSE_ALARM / records.size)]
-    at = at[np.array([_others_move(records, channel, stretch, is_base) for stretch in at], dtype=bool)]
+    at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
+    at = at[np.array([_others_move(records, channel, stretch, is_base, lively) for stretch in at], dtype=bool)]
     zero = np.abs(record[at[:, 0]]) <= tolerance
     if np.any(zero):
         yield _damage("dropout", channel, at[zero], 0.0)
@@ -154,12 +151,13 @@ def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> D
     return DamagedSamples(kind, channel, stretches[np.argsort(stretches[:, 0])], value)
 
 
-def _log_chance_of_tops(record: Array, at: Stretches, quantum: float) -> float:
+def _log_chance_of_tops(record: Array, at: Stretches, quantum: float, nearest: int = 8, more: float = 1.5) -> float:
     """Logarithm of the chance that a sound record has its highest value at all of these stretches.
 
     Of steps q. A smooth top of L samples within a step falls by at most ((1 + 2/L)² + 1) q to its neighbours; where
     both fall by d and more, each further sample shares the step by a chance of q / d. Tops that share a step without
-    a flat are as many as a density with the singularity of a sine makes of the values next to them.
+    a flat are as many as a density with the singularity of a sine makes of the `nearest` values next to them, or
+    `more` times as many.
     """
     first, last = at.T
     length, inside = last - first + 1, (first > 0) & (last < record.size - 1)
@@ -175,17 +173,20 @@ def _log_chance_of_tops(record: Array, at: Stretches, quantum: float) -> float:
     below = np.sort(np.partition(record, -min(record.size, int(length.sum()) + 2000))[-int(length.sum()) - 2000 :])
     below = below[below < top - 0.5 * quantum]
     distinct = below[np.concatenate([np.diff(below) > 0.5 * quantum, [True]])] if below.size else below
-    if count > 1 and distinct.size >= _NEAREST:
-        share = np.sqrt(quantum / (top - distinct[-_NEAREST] + quantum))  # of a sine's values there, in its last step
-        expected = np.count_nonzero(below >= distinct[-_NEAREST]) * share / (1 - share)
-        log += float(np.log(max(scipy.special.gammainc(count - 1, _MORE * expected), 1e-300)))
+    if count > 1 and distinct.size >= nearest:
+        share = np.sqrt(quantum / (top - distinct[-nearest] + quantum))  # of a sine's values there, in its last step
+        expected = np.count_nonzero(below >= distinct[-nearest]) * share / (1 - share)
+        log += float(np.log(max(scipy.special.gammainc(count - 1, more * expected), 1e-300)))
     return log
 
 
-def _held(record: Array, at: Stretches, quantum: float, chance: float) -> NDArray[np.bool_]:
+def _held(
+    record: Array, at: Stretches, quantum: float, chance: float, lively: float, edge: int = 8, least: float = 1.5
+) -> NDArray[np.bool_]:
     """Which stretches of one value, (k, 2), a sound record that moves as it does on both sides would not have.
 
-    The record moves up to the edges, by more than a step; what begins or ends at rest is let pass.
+    In the `edge` samples beside it the record moves by `least` steps, and is `lively` against more samples there; what
+    begins or ends at rest is let pass.
     """
     first, last = at.T
     steps = np.diff(record)
@@ -198,16 +199,16 @@ def _held(record: Array, at: Stretches, quantum: float, chance: float) -> NDArra
         before, after = (power[first] - power[start]) / width, (power[end] - power[last]) / width
         return np.sqrt([np.where(first > 0, before, np.inf), np.where(last < n, after, np.inf)])
 
-    near, about = motion(_EDGE), motion(_AROUND)
+    near, about = motion(edge), motion(_AROUND)
     about[:, (first == 0) | (last == n)] = np.sqrt(power[-1] / n)
-    moves = np.all(np.isinf(near) | (near >= np.maximum(_LIVELY * about, _STEPS * quantum)), axis=0)
+    moves = np.all(np.isinf(near) | (near >= np.maximum(lively * about, least * quantum)), axis=0)
     sides = motion(few)
     sides = np.where(np.isinf(sides), sides[::-1], sides)
     size = np.maximum(np.sqrt(2 * np.pi * sides[0] * sides[1]), quantum)
     return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
 
 
-def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool) -> bool:
+def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool, lively: float) -> bool:
     """False of a rest: what stands still at an end of a record with most of the others, or a base that does."""
     first, last = stretch
     n = records.shape[1]
@@ -217,16 +218,10 @@ def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool
         return False
     others = np.delete(records, channel, axis=0)
     within = np.std(np.diff(others[:, first : last + 1]), axis=1)
-    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > _LIVELY)
+    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > lively)
 
 
 # Spikes: samples that those around them do not predict.
-
-_OUT = 8.0  # times what is not predicted beside them
-_HIT = 5.0  # of the same: other channels that have as much at once say that the structure was hit
-_TOP = 0.75  # of the highest estimate about a sample
-_FOOT = 3  # samples beside a spike that it may reach
-_CLEAR = 16  # samples about stretches that are damaged already, and at the ends, where nothing is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,65 +229,63 @@ class _Errors:
     """Estimates of errors of one sample, and of two that have the same, beside what they usually are.
 
     An error h of the samples of a spectrum D has the estimate ``sum(D* X / S) / sum(|D|² / S)`` in a record X of the
-    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, (channels, 2,
-    parts), and `around` the size of the record there, (channels, parts).
+    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, and `level` what is
+    beyond them and the size of the record there, (channels, 2, parts).
     """
 
     heights: Array
     usual: Array
-    around: Array
+    level: Array
     parts: Stretches
 
     @classmethod
-    def of(cls, records: Array, quanta: Array) -> _Errors:
+    def of(cls, records: Array, quanta: Array, out: float = 8.0) -> _Errors:
         n = records.shape[1]
         parts = np.append(np.arange(0, max(n - _AROUND, 0) + 1, _AROUND), n)
         heights = np.array([_heights(record) for record in records])
         usual = np.sqrt(np.pi / 2) * np.array([[_beside(its, parts) for its in both] for both in heights])
         around = np.array([_beside(np.abs(record - record.mean()), parts) for record in records])
-        return cls(heights, usual, np.maximum(around, _OUT * quanta[:, None]), parts)
+        level = np.maximum(out * usual, np.maximum(around, out * quanta[:, None])[:, None])
+        return cls(heights, usual, level, parts)
 
     def candidates(self, channel: int) -> Iterator[tuple[int, int, int]]:
         """First and last sample, and the part, of all that stand out in a channel."""
         for more, height in enumerate(self.heights[channel]):
-            level = np.maximum(_OUT * self.usual[channel, more], self.around[channel])
+            level = self.level[channel, more]
             for part in np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level):
                 start, end = self.parts[part : part + 2]
                 for at in start + np.flatnonzero(height[start:end] > level[part]):
                     yield int(at), int(at + more), int(part)
 
-    def is_spike(self, channel: int, first: int, last: int, part: int) -> bool:
+    def is_spike(
+        self, channel: int, first: int, last: int, part: int, foot: int = 3, top: float = 0.75, hit: float = 5.0
+    ) -> bool:
         """True of the highest there, of as many samples as stand out most, where no other channel stands out."""
-        reach = slice(max(first - _FOOT, 0), first + _FOOT + 1)
+        reach = slice(max(first - foot, 0), first + foot + 1)
         tops = self.heights[:, :, reach].max(axis=2)
         times = tops / np.maximum(self.usual[:, :, part], np.finfo(float).tiny)
         own, more = times[channel], last - first
-        highest = self.heights[channel, more, first] > _TOP * tops[channel, more]
-        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > _HIT) == 1)
+        highest = self.heights[channel, more, first] > top * tops[channel, more]
+        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > hit) == 1)
 
 
-def _spikes(records: Array, quanta: Array, held: list[Stretches]) -> Iterator[DamagedSamples]:
+def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
     """Samples of one channel that stand out of what all others of it predict.
 
     They are held against what is usual beside them, and against the record there. Where other channels have such
-    samples at once, the structure was hit.
+    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`.
     """
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
     for channel in range(len(records)):
         flags = np.zeros(n, dtype=bool)
         for first, last, part in errors.candidates(channel):
-            clear = _CLEAR <= first < n - _CLEAR and _is_clear(held[channel], first)
-            if clear and errors.is_spike(channel, first, last, part):
+            near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
+            if clear <= first < n - clear and not near and errors.is_spike(channel, first, last, part):
                 flags[first : last + 1] = True
         if np.any(flags):
             size = errors.heights[channel].max(axis=0)
             yield DamagedSamples("spikes", channel, _runs(flags), float(size[flags].max()))
-
-
-def _is_clear(held: Stretches, at: int) -> bool:
-    """True of a sample that is not near any stretch."""
-    return not np.any((held[:, 0] - _CLEAR <= at) & (at <= held[:, 1] + _CLEAR))
 
 
 def _heights(record: Array) -> tuple[Array, Array]:
@@ -324,46 +317,54 @@ def _beside(size: Array, parts: Stretches) -> Array:
 
 # Hum: a line of one channel that the other channels do not predict, steady along the record.
 
-_STANDS_OUT = 40.0  # times the median power of what is not predicted about a line
-_ALONE = 15.0  # of the same, that no other channel may have without the one that hums
-_LOUD = 0.01  # amplitude of hum over a channel's rms: less is what steps make of a sine
-_STEADY = 8.0  # power of a steady sine at the lines about it over what it leaves of them
 
+def _tones(records: Array, stands_out: float = 40.0, low: int = 4) -> Iterator[DamagedSamples]:
+    """Steady sines of single channels, by lines of a windowed record that linear combinations of the others lack.
 
-def _tones(records: Array) -> Iterator[DamagedSamples]:
-    """Steady sines of single channels, by lines of a windowed record that linear combinations of the others lack."""
+    The `low` first lines hold means and drift. A tone stands so many times out of the median power of what is not
+    predicted about it.
+    """
     channels, n = records.shape
     lines, width = n // 2, max(64, 6 * channels)
     if channels < 3 or lines < 2 * width:
         return
     size = np.std(records, axis=1, keepdims=True)
     moving = np.where(size > 0, (records - records.mean(axis=1, keepdims=True)) / np.where(size > 0, size, 1.0), 0.0)
-    spectra = scipy.fft.rfft(moving * np.hanning(n))[:, _FOOT + 1 :]
+    spectra = scipy.fft.rfft(moving * np.hanning(n))[:, low:]
     count = spectra.shape[1] // width
     blocks = np.moveaxis(spectra[:, : count * width].reshape(channels, count, width), 0, 1)
     times = _power(_unpredicted(blocks))
     best, told = times.max(axis=2), set()
-    for block in np.flatnonzero(np.any(best > _STANDS_OUT, axis=1)):
+    for block in np.flatnonzero(np.any(best > stands_out, axis=1)):
         channel = int(np.argmax(best[block]))
         start = block * width + int(np.argmax(times[block, channel])) - width // 2
         start = min(max(start, 0), spectra.shape[1] - width)
-        at, place, alone = _tone_at(spectra[:, start : start + width], channel, n)
-        line = start + at + _FOOT + 1 + place
+        at, place, alone = _tone_at(spectra[:, start : start + width], channel, n, stands_out)
+        line = start + at + low + place
         if alone and (channel, round(line)) not in told:
             told.add((channel, round(line)))
             yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), line / n)
 
 
-def _tone_at(lines: ComplexArray, channel: int, samples: int) -> tuple[int, float, bool]:
-    """Line of a tone of a channel among lines (channels, k), its place from there, and whether it is one, and alone."""
+def _tone_at(
+    lines: ComplexArray, channel: int, samples: int, stands_out: float, loud: float = 0.01, sine: float = 8.0,
+    elsewhere: float = 15.0,
+) -> tuple[int, float, bool]:  # fmt: skip
+    """Line of a tone of a channel among lines (channels, k), its place from there, and whether it is one, and alone.
+
+    It is `loud` against the channel's rms, beyond what steps make of a sine; it leaves little of the lines about it
+    (`sine`); and without its channel no other stands out as much as `elsewhere`.
+    """
     blocks = lines[None]
-    at = int(np.argmax(np.abs(_unpredicted(blocks)[0, channel])))
-    reach = np.arange(max(at - _FOOT, 0), min(at + _FOOT + 1, lines.shape[1]))
+    times = _power(_unpredicted(blocks))[0, channel]
+    at = int(np.argmax(times))
+    reach = np.arange(max(at - 3, 0), min(at + 4, lines.shape[1]))
     left = _unpredicted(blocks, np.delete(blocks, reach, axis=2))[0, channel]
     place, steady = _steady(left[reach], reach - at)
-    loud = np.abs(left[at]) > _LOUD * samples / 4  # a Hann window's peak of a sine of this amplitude
+    size = np.abs(left[at]) / (samples / 4)  # a Hann window's peak of a sine of one
     others = _power(_unpredicted(np.delete(blocks, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
-    return at, place, bool(loud and steady > _STEADY and others.max() < _ALONE)
+    stands = times[at] > stands_out and others.max() < elsewhere
+    return at, place, bool(stands and size > loud and steady > sine)
 
 
 def _unpredicted(blocks: ComplexArray, fitted: ComplexArray | None = None) -> ComplexArray:
