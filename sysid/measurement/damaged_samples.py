@@ -248,13 +248,21 @@ class _Errors:
         level = np.maximum(out * usual, np.maximum(around, out * quanta[:, None])[:, None])
         return cls(heights, usual, level, parts)
 
-    def candidates(self, channel: int) -> Iterator[tuple[int, int, int]]:
-        """First and last sample, and the part, of all that stand out in a channel."""
+    def candidates(self, channel: int, out: float = 8.0, apart: float = 1.5) -> Iterator[tuple[int, int, int]]:
+        """First and last sample, and the part, of all that stand out in a channel.
+
+        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones.
+        """
         for more, height in enumerate(self.heights[channel]):
             level = self.level[channel, more]
-            for part in np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level):
+            high = np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level)
+            if not high.size:
+                continue
+            times = height / np.repeat(np.maximum(self.usual[channel, more], np.finfo(float).tiny), np.diff(self.parts))
+            least = apart * np.max(times[times < out])
+            for part in high:
                 start, end = self.parts[part : part + 2]
-                for at in start + np.flatnonzero(height[start:end] > level[part]):
+                for at in start + np.flatnonzero((height[start:end] > level[part]) & (times[start:end] > least)):
                     yield int(at), int(at + more), int(part)
 
     def is_spike(
