@@ -38,6 +38,7 @@ from sysid.files import description, reading
 from sysid.files.assembly import work_of_force
 from sysid.finding import Finding, Severity
 from sysid.jobs import JobResult
+from sysid.measurement.damaged_runs import DamagedChannel
 from sysid.nlp import time_too_short
 from sysid.report import html, report
 from sysid.results.checkpoint import Checkpoint, RunRequest
@@ -640,3 +641,35 @@ def test_what_a_file_leaves_open_is_remarked(here):
     assert reading.gather(Path("frf.npz"), said | {"sensor": [top | {"column": "h1"}]}).remarks == (
         "frf.npz: array 'w': frequencies have no unit, and are taken as Hz", "spectra follow exp(+iwt), as stated",
     )  # fmt: skip
+
+
+DAMAGED = [
+    (
+        ("clipped", 366, 807, 5.711), False,
+        "sensor 2 is damaged: 807 of 6000 samples (13 %) in 366 places from 1.5 to 118.25 s hold its largest value, "
+        "5.711: a range that was too small; leave this channel out, cut the record there, or record it anew",
+    ),
+    (
+        ("dropout", 1, 40, 0.0), True,
+        "sensor 2 is damaged: 40 of 6000 samples (0.67 %) from 1.5 to 118.25 s are zero while the other channels move: "
+        "a gap; the run is cut there, and what is damaged left out",
+    ),
+    (
+        ("tone", 1, 6000, 50.0), False,
+        "sensor 2 hums at 50 Hz all along: a steady tone that no other channel has; it stays in the records: find its "
+        "source, such as the mains or a fan, or leave this channel out",
+    ),
+    (
+        ("equal channels", 1, 6000, 1.0), False,
+        "sensor 2 holds the same samples as sensor 1: one record stands in two places; read the right one, or leave "
+        "this channel out",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "left_out", "sentence"), DAMAGED, ids=[made[0] for made, _, _ in DAMAGED])
+def test_damage_is_told_with_channel_place_count_and_remedy(made, left_out, sentence):
+    kind, places, count, value = made
+    stretches = np.linspace(1.5, 118.25, 2 * places).reshape(-1, 2)
+    one = DamagedChannel(kind, 1, "sensor 2", stretches, count, 6000, value, "sensor 1", left_out)
+    assert f"{one.sentence}; {one.remedy}" == sentence

@@ -37,7 +37,13 @@ def run(options: argparse.Namespace, out: Output) -> int:
 def tell_channels(test: recorded_test.RecordedTest, out: Output) -> None:
     """Write the channels of a test and what was noticed while it was read."""
     out.write(f"{test.in_words()}\n")
-    out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
+    damage = test.damage
+    for one in damage:
+        out.write(f"run {one.run}: {one.sentence}\n")
+    out.answer(
+        channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs),
+        damage=[{**vars(one), "stretches": one.stretches.tolist()} for one in damage],
+    )  # fmt: skip
     tell_band(test, "the lines that 'sysid run' fits where no --band is given", out)
 
 

@@ -13,8 +13,10 @@ import numpy as np
 
 from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
+from sysid.measurement.damaged_runs import DamagedChannel, damage_of_runs, names_of_channels
 from sysid.measurement.excited_band import excited_band
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.spectra import TimeRun
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
 
@@ -76,6 +78,15 @@ class RecordedTest:
     def excited_band(self) -> tuple[float, float] | None:
         """The band that the base excites, Hz (`sysid.excited_band`); None of spectra."""
         return None if self.sample_rate is None else excited_band(self.runs, self.sample_rate)
+
+    @property
+    def damage(self) -> list[DamagedChannel]:
+        """Damaged samples of the records in time; none of spectra."""
+        if self.sample_rate is None:
+            return []
+        G = rigid_body(sensors=self.sensors, base_axes=self.base_axes, origin=self.origin)
+        names = names_of_channels(self.sensors, G, self.base_axes)
+        return damage_of_runs([TimeRun(*run) for run in self.runs], self.sample_rate, names)
 
     def measurement(self, **options: Any) -> Measurement:
         """The measurement; `options` are those of `Measurement.from_time`, of spectra ``band`` alone.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any, Literal
 
@@ -20,8 +20,9 @@ from sysid.errors import (
     whole_number,
 )
 from sysid.measurement import spectra
+from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
 from sysid.measurement.gains import tolerances
-from sysid.measurement.spectra import Missing, complete, named, present
+from sysid.measurement.spectra import Missing, checked_deviations, checked_lines, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -75,6 +76,8 @@ class Measurement:
     gain_std, base_gain_std, force_gain_std : array_like, optional
         Tolerances: standard deviations of the relative error of each gain, of the sensors (n_sensors,), of the base's
         (d,) and of the force's (d,); one number is that of all. By default those that `sensors` state, others exact.
+    damage : tuple of DamagedChannel
+        Damaged samples of the records of which `from_time` makes it.
 
     Notes
     -----
@@ -100,6 +103,7 @@ class Measurement:
     gain_std: Array | None = field(default=None, kw_only=True)
     base_gain_std: Array | None = field(default=None, kw_only=True)
     force_gain_std: Array | None = field(default=None, kw_only=True)
+    damage: tuple[DamagedChannel, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -113,12 +117,12 @@ class Measurement:
             put("dropped", self.dropped + self.freq.size - there["freq"].size)
             for name, record in there.items():
                 put(name, record)
-        put("base", _records("base", self.base, self.freq.size))
-        put("response", _records("response", self.response, self.freq.size))
+        put("base", checked_lines("base", self.base, self.freq.size))
+        put("response", checked_lines("response", self.response, self.freq.size))
         put("rigid_body", motion_of_sensors(self.rigid_body, self.sensors, self.base_axes, self.base.shape[1]))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
         if self.force is not None:
-            put("force", _records("force", self.force, self.freq.size))
+            put("force", checked_lines("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
                 raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
         put("sensors", checked_sensors(self.sensors))
@@ -138,8 +142,8 @@ class Measurement:
         )
         put("base_axes", axes_of_base(self.base_axes, self.sensors or (), self.rigid_body))
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names)))
-        put("response_std", _std("response_std", self.response_std, self.response))
-        put("force_std", _std("force_std", self.force_std, self.force))
+        put("response_std", checked_deviations("response_std", self.response_std, self.response))
+        put("force_std", checked_deviations("force_std", self.force_std, self.force))
         if self.gain_std is None and any(sensor.gain_std for sensor in self.sensors or ()):
             put("gain_std", np.array([sensor.gain_std for sensor in self.sensors or ()]))
         for name, count in (("gain_std", sensors), ("base_gain_std", d), ("force_gain_std", d)):
@@ -160,6 +164,7 @@ class Measurement:
             "averaged": self.averaged, "whole": self.whole and self.whole.to_tree(),
             "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
             "force_gain_std": self.force_gain_std,
+            "damage": [one.to_tree() for one in self.damage],
         }  # fmt: skip
 
     @classmethod
@@ -167,7 +172,9 @@ class Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole})
+        damage = tuple(map(DamagedChannel.from_tree, tree["damage"]))
+        given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
+        return cls(**{**tree, **given})
 
     @property
     def translational(self) -> NDArray[np.bool_]:
@@ -339,12 +346,17 @@ class Measurement:
         choice("missing", missing, ("refuse", "drop"))
         read = numbers if missing == "drop" else complete  # lines with NaN go where the records have all runs
         H = read("frf", frf, complex)
-        H = _records("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
+        H = checked_lines("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
         d = H.shape[1]
-        F = None if force is None else _records("force", force, lines.size, read)
+        F = None if force is None else checked_lines("force", force, lines.size, read)
         if F is not None and F.shape != (d, d, lines.size):
             raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}")
-        given = H, F, _std("response_std", response_std, H, read), _std("force_std", force_std, F, read)
+        given = (
+            H,
+            F,
+            checked_deviations("response_std", response_std, H, read),
+            checked_deviations("force_std", force_std, F, read),
+        )
         # The base direction comes first: it becomes the run.
         by_run: Any = [None if record is None else np.moveaxis(record, 1, 0) for record in given]
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
@@ -414,25 +426,28 @@ class Measurement:
         G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         described = checked_sensors(sensors)
+        sound = sound_runs(
+            records, float(sample_rate), names_of_channels(described, G, base_axes), cut=estimator == "records"
+        )
         others = as_float("base_delay", base_delay), as_float("force_delay", force_delay)
         records = spectra.runs_on_one_clock(
-            records, np.append(stated_delays(described, len(G)), others), float(sample_rate)
+            sound.runs, np.append(stated_delays(described, len(G)), others), float(sample_rate)
         )
         given: Any = {"rigid_body": G, "sensors": without_delay(described), "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             if estimator == "records":
-                given["whole"] = whole_of(records, float(sample_rate), at_rest, noise, G)
+                given["whole"] = whole_of(records, float(sample_rate), sound.rests(at_rest), sound.levels(noise), G)
             else:
                 given["sample_rate"] = float(sample_rate)
-            test = cls(freq, base, response, force=force, **given)
+            test = cls(freq, base, response, force=force, damage=sound.damage, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
-            test = replace(test, averaged=True)
+            test = replace(test, averaged=True, damage=sound.damage)
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
@@ -449,27 +464,3 @@ def stated_delays(sensors: Sequence[Sensor] | None, count: int) -> Array:
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
     """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
-
-
-def _records(name: str, value: Any, n_freq: int, read: Callable[..., Any] = complete) -> ComplexArray:
-    array: ComplexArray = read(name, value, complex)
-    if array.ndim == 2:
-        array = array[None]
-    if array.ndim != 3 or array.shape[-1] != n_freq:
-        raise InputError(f"{name} has shape {array.shape}; (runs, channels, {n_freq}) is needed, frequency last")
-    return array
-
-
-def _std(name: str, value: Any, record: ComplexArray | None, read: Callable[..., Any] = complete) -> Array | None:
-    if value is None:
-        return None
-    if record is None:
-        raise InputError(f"{name} is given without its record")
-    array = read(name, value)
-    try:
-        full = np.broadcast_to(array, record.shape).copy()
-    except ValueError:
-        raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
-    if np.any(full < 0):
-        raise InputError(f"{name} holds negative entries")
-    return full

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -393,3 +393,31 @@ def complete(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
         if not np.any(np.isnan(numbers(name, value, kind))):
             raise
         raise InputError(f"{error}; missing='drop' leaves out the lines at which anything is NaN") from None
+
+
+def checked_lines(name: str, value: Any, n_freq: int, read: Callable[..., Any] = complete) -> ComplexArray:
+    """Spectra (runs, channels, n_freq) of a number of lines; one run may be given without its axis."""
+    array: ComplexArray = read(name, value, complex)
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or array.shape[-1] != n_freq:
+        raise InputError(f"{name} has shape {array.shape}; (runs, channels, {n_freq}) is needed, frequency last")
+    return array
+
+
+def checked_deviations(
+    name: str, value: Any, record: ComplexArray | None, read: Callable[..., Any] = complete
+) -> Array | None:
+    """Deviations of a record, of its shape; None where none are given."""
+    if value is None:
+        return None
+    if record is None:
+        raise InputError(f"{name} is given without its record")
+    array = read(name, value)
+    try:
+        full = np.broadcast_to(array, record.shape).copy()
+    except ValueError:
+        raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
+    if np.any(full < 0):
+        raise InputError(f"{name} holds negative entries")
+    return full

@@ -6,12 +6,13 @@ the table in docs/mistakes.md is made. Before a search the records alone are loo
 
 from __future__ import annotations
 
-from sysid.assessment.checks import against_records, gains, mistakes, model_error, search_end, stated
+from sysid.assessment.checks import against_records, damaged_samples, gains, mistakes, model_error, search_end, stated
 from sysid.assessment.checks.context import Check
 
 CHECKS: tuple[Check, ...] = (
     mistakes.late_channels,
     mistakes.wrong_records,
+    damaged_samples.damaged_channels,
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
@@ -41,4 +42,4 @@ OF_THE_END: tuple[Check, ...] = (
     model_error.beyond_noise,
     search_end.no_solution,
 )  # whether a search ended at a fit
-QUICK: tuple[Check, ...] = (*CHECKS[:2], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])
+QUICK: tuple[Check, ...] = (*CHECKS[:3], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])

@@ -1,0 +1,404 @@
+"""Damaged samples of records in time: flat tops, gaps, held values, equal channels, spikes, hum of one channel.
+
+Each is judged by its likelihood in a sound record of the same quantisation and rate of change, at one rate of false
+alarms for all channels and samples of a run:
+
+- A quantised record has equal neighbours by chance: where it changes by d a sample, two of them share a step q with
+  probability q / d. Flat tops of smooth motion are no steeper beside them than a parabola.
+- Hum and spikes are what the other channels, or the samples around, do not predict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF
+
+Damage = Literal["equal channels", "clipped", "dropout", "held value", "spikes", "tone"]
+Stretches = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class DamagedSamples:
+    """Damage of one kind in one channel of a run.
+
+    Attributes
+    ----------
+    kind : str
+    channel : int
+        Row of the records.
+    stretches : (k, 2)
+        First and last sample of each, both included.
+    value : float
+        Of "clipped" the largest level in magnitude, of "held value" the first value, of "spikes" the largest height,
+        in the unit of the record; of "tone" its frequency, in cycles a sample; of "equal channels" the other's row.
+    """
+
+    kind: Damage
+    channel: int
+    stretches: Stretches
+    value: float
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return int(np.sum(self.stretches[:, 1] - self.stretches[:, 0] + 1))
+
+
+def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
+    """Damage of the records of a run.
+
+    Parameters
+    ----------
+    records : (channels, n)
+        The base first, `n_base` of them: a base may begin and end at rest while sensors move.
+
+    Returns
+    -------
+    list of DamagedSamples
+        Channel by channel; the worst of each channel first. None of channels that never move.
+    """
+    if records.shape[1] < _AROUND:
+        return []
+    found = list(_equal(records, n_base))
+    held: list[Stretches] = []
+    quanta = [_quantum(record) for record in records]
+    for channel, quantum in enumerate(quanta):
+        stretches = [np.zeros((0, 2), np.intp)]
+        for one in _flat(records, channel, quantum, is_base=channel < n_base):
+            found.append(one)
+            stretches.append(one.stretches)
+        held.append(np.concatenate(stretches))
+    found += _spikes(records, np.array(quanta), held)
+    sound = np.delete(np.arange(len(records)), [one.channel for one in found])
+    found += [replace(one, channel=int(sound[one.channel])) for one in _tones(records[sound])]
+    return sorted(found, key=lambda one: one.channel)
+
+
+def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamples]:
+    """Channels with the same samples as one before, that change `least` times at least.
+
+    A base may move along two of its axes alike.
+    """
+    sizes = np.sum(np.abs(records), axis=1)
+    for channel in range(max(n_base, 1), len(records)):
+        for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
+            one = records[channel]
+            if np.array_equal(one, records[other]) and np.count_nonzero(np.diff(one)) >= least:
+                yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
+                break
+
+
+# Flat tops and held values.
+
+_AROUND = 64  # samples on either side, of which what is usual about others is told
+
+
+def _quantum(record: Array) -> float:
+    """Step of a record: the least difference of neighbours where it is large; equal ones are within round-off."""
+    size = np.abs(record)
+    steps = np.abs(np.diff(record))[size[1:] >= 0.1 * size.max()]
+    tolerance = ROUND_OFF * float(size.max())
+    steps = steps[steps > tolerance]
+    return float(steps.min()) if steps.size else tolerance
+
+
+def _runs(flags: NDArray[np.bool_]) -> Stretches:
+    """First and last of each run of true flags, (k, 2)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return np.column_stack([edges[::2], edges[1::2] - 1])
+
+
+def _flat(
+    records: Array, channel: int, quantum: float, *, is_base: bool, lively: float = 0.12
+) -> Iterator[DamagedSamples]:
+    """Flat tops, then gaps, then held values of a channel."""
+    record = records[channel]
+    if quantum == 0.0:  # it is zero all along
+        return
+    tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
+    ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
+    logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
+    if abs(record.max() + record.min()) < quantum:  # of one range
+        logs = [sum(logs)] * 2
+    is_gap = [len(at) == 1 and abs(record[at[0, 0]]) <= tolerance for at in ends]
+    tops = [at for at, log, gap in zip(ends, logs, is_gap, strict=True) if log < chance and not gap]
+    clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
+    if len(clipped):
+        yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
+    at = _runs(np.abs(np.diff(record)) <= tolerance)  # of differences: a stretch has one sample more
+    at[:, 1] += 1
+    at = at[at[:, 1] - at[:, 0] > 1]
+    if len(clipped):
+        at = at[~np.isin(at[:, 0], clipped[:, 0])]
+    at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
+    at = at[np.array([_others_move(records, channel, stretch, is_base, lively) for stretch in at], dtype=bool)]
+    zero = np.abs(record[at[:, 0]]) <= tolerance
+    if np.any(zero):
+        yield _damage("dropout", channel, at[zero], 0.0)
+    if not np.all(zero):
+        yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
+
+
+def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> DamagedSamples:
+    return DamagedSamples(kind, channel, stretches[np.argsort(stretches[:, 0])], value)
+
+
+def _log_chance_of_tops(record: Array, at: Stretches, quantum: float, nearest: int = 8, more: float = 1.5) -> float:
+    """Logarithm of the chance that a sound record has its highest value at all of these stretches.
+
+    Of steps q. A smooth top of L samples within a step falls by at most ((1 + 2/L)² + 1) q to its neighbours; where
+    both fall by d and more, each further sample shares the step by a chance of q / d. Tops that share a step without
+    a flat are as many as a density with the singularity of a sine makes of the `nearest` values next to them, or
+    `more` times as many.
+    """
+    first, last = at.T
+    length, inside = last - first + 1, (first > 0) & (last < record.size - 1)
+    top = record[first[0]]
+    fall = top - np.maximum(record[np.maximum(first - 1, 0)], record[np.minimum(last + 1, record.size - 1)])
+    steep = inside & (length > 1) & (fall > quantum * ((1 + 2 / length) ** 2 + 1))
+    each = np.where(steep, (length - 1) * np.log(quantum / np.where(steep, fall, 1.0)), 0.0)
+    count, flat = len(at), int(np.count_nonzero(steep))
+    after = record[np.minimum(last + 1, record.size - 1)]
+    if count > 2 and np.median(np.abs(after - np.median(after))) < 4 * quantum:  # one phase of a sine: one chance
+        return float(each.min())
+    log = float(each.sum()) + float(np.log(scipy.special.binom(count, flat)) if flat < count else 0.0)
+    below = np.sort(np.partition(record, -min(record.size, int(length.sum()) + 2000))[-int(length.sum()) - 2000 :])
+    below = below[below < top - 0.5 * quantum]
+    distinct = below[np.concatenate([np.diff(below) > 0.5 * quantum, [True]])] if below.size else below
+    if count > 1 and distinct.size >= nearest:
+        share = np.sqrt(quantum / (top - distinct[-nearest] + quantum))  # of a sine's values there, in its last step
+        expected = np.count_nonzero(below >= distinct[-nearest]) * share / (1 - share)
+        log += float(np.log(max(scipy.special.gammainc(count - 1, more * expected), 1e-300)))
+    return log
+
+
+def _held(
+    record: Array, at: Stretches, quantum: float, chance: float, lively: float, edge: int = 8, least: float = 1.5
+) -> NDArray[np.bool_]:
+    """Which stretches of one value, (k, 2), a sound record that moves as it does on both sides would not have.
+
+    In the `edge` samples beside it the record moves by `least` steps, and is `lively` against more samples there; what
+    begins or ends at rest is let pass.
+    """
+    first, last = at.T
+    steps = np.diff(record)
+    power = np.concatenate([[0.0], np.cumsum(steps**2)])
+    few = np.clip((last - first + 1) // 6, 2, _AROUND)
+    n = steps.size  # those before a stretch end at `first`, those behind it begin at `last`
+
+    def motion(width: Stretches | int) -> Array:
+        start, end = np.maximum(first - width, 0), np.minimum(last + width, n)
+        before, after = (power[first] - power[start]) / width, (power[end] - power[last]) / width
+        return np.sqrt([np.where(first > 0, before, np.inf), np.where(last < n, after, np.inf)])
+
+    near, about = motion(edge), motion(_AROUND)
+    about[:, (first == 0) | (last == n)] = np.sqrt(power[-1] / n)
+    moves = np.all(np.isinf(near) | (near >= np.maximum(lively * about, least * quantum)), axis=0)
+    sides = motion(few)
+    sides = np.where(np.isinf(sides), sides[::-1], sides)
+    size = np.maximum(np.sqrt(2 * np.pi * sides[0] * sides[1]), quantum)
+    return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
+
+
+def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool, lively: float) -> bool:
+    """False of a rest: what stands still at an end of a record with most of the others, or a base that does."""
+    first, last = stretch
+    n = records.shape[1]
+    if first > 0 and last < n - 1:
+        return True
+    if is_base:
+        return False
+    others = np.delete(records, channel, axis=0)
+    within = np.std(np.diff(others[:, first : last + 1]), axis=1)
+    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > lively)
+
+
+# Spikes: samples that those around them do not predict.
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Estimates of errors of one sample, and of two that have the same, beside what they usually are.
+
+    An error h of the samples of a spectrum D has the estimate ``sum(D* X / S) / sum(|D|² / S)`` in a record X of the
+    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, and `level` what is
+    beyond them and the size of the record there, (channels, 2, parts).
+    """
+
+    heights: Array
+    usual: Array
+    level: Array
+    parts: Stretches
+
+    @classmethod
+    def of(cls, records: Array, quanta: Array, out: float = 8.0) -> _Errors:
+        n = records.shape[1]
+        parts = np.append(np.arange(0, max(n - _AROUND, 0) + 1, _AROUND), n)
+        heights = np.array([_heights(record) for record in records])
+        usual = np.sqrt(np.pi / 2) * np.array([[_beside(its, parts) for its in both] for both in heights])
+        around = np.array([_beside(np.abs(record - record.mean()), parts) for record in records])
+        level = np.maximum(out * usual, np.maximum(around, out * quanta[:, None])[:, None])
+        return cls(heights, usual, level, parts)
+
+    def candidates(self, channel: int, out: float = 8.0, apart: float = 1.5) -> Iterator[tuple[int, int, int]]:
+        """First and last sample, and the part, of all that stand out in a channel.
+
+        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones.
+        """
+        for more, height in enumerate(self.heights[channel]):
+            level = self.level[channel, more]
+            high = np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level)
+            if not high.size:
+                continue
+            times = height / np.repeat(np.maximum(self.usual[channel, more], np.finfo(float).tiny), np.diff(self.parts))
+            least = apart * np.max(times[times < out])
+            for part in high:
+                start, end = self.parts[part : part + 2]
+                for at in start + np.flatnonzero((height[start:end] > level[part]) & (times[start:end] > least)):
+                    yield int(at), int(at + more), int(part)
+
+    def is_spike(
+        self, channel: int, first: int, last: int, part: int, foot: int = 3, top: float = 0.75, hit: float = 5.0
+    ) -> bool:
+        """True of the highest there, of as many samples as stand out most, where no other channel stands out."""
+        reach = slice(max(first - foot, 0), first + foot + 1)
+        tops = self.heights[:, :, reach].max(axis=2)
+        times = tops / np.maximum(self.usual[:, :, part], np.finfo(float).tiny)
+        own, more = times[channel], last - first
+        highest = self.heights[channel, more, first] > top * tops[channel, more]
+        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > hit) == 1)
+
+
+def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
+    """Samples of one channel that stand out of what all others of it predict.
+
+    They are held against what is usual beside them, and against the record there. Where other channels have such
+    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`.
+    """
+    n = records.shape[1]
+    errors = _Errors.of(records, quanta)
+    for channel in range(len(records)):
+        flags = np.zeros(n, dtype=bool)
+        for first, last, part in errors.candidates(channel):
+            near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
+            if clear <= first < n - clear and not near and errors.is_spike(channel, first, last, part):
+                flags[first : last + 1] = True
+        if np.any(flags):
+            size = errors.heights[channel].max(axis=0)
+            yield DamagedSamples("spikes", channel, _runs(flags), float(size[flags].max()))
+
+
+def _heights(record: Array) -> tuple[Array, Array]:
+    """Estimates of the size of an error of each sample, and of each two that have the same, (n,)."""
+    n = record.size
+    ramp = record[0] + np.linspace(0, 1, n) * (record[-1] - record[0])
+    spectrum = scipy.fft.rfft(record - ramp)
+    power = np.abs(spectrum) ** 2
+    if not np.any(power > np.finfo(float).tiny):
+        return np.zeros(n), np.zeros(n)
+    width = max(power.size // 256, 4)
+    starts = np.arange(0, max(power.size - width, 1), width)
+    sizes = np.diff(np.append(starts, power.size))
+    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes)
+    single = scipy.fft.irfft(spectrum / smooth, n)
+    # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
+    twice = (2 * np.cos(np.linspace(0, np.pi / 2, power.size))) ** 2 / smooth
+    return np.abs(single) / np.mean(1 / smooth), np.abs(single + np.roll(single, -1)) / np.mean(twice)
+
+
+def _beside(size: Array, parts: Stretches) -> Array:
+    """The larger of the means of sizes (n,) over the parts before and behind each part, whose edges are `parts`.
+
+    Those at the ends have themselves beside them.
+    """
+    mean = np.pad(np.add.reduceat(size, parts[:-1]) / np.diff(parts), 1, mode="edge")
+    return np.asarray(np.maximum(mean[:-2], mean[2:]))
+
+
+# Hum: a line of one channel that the other channels do not predict, steady along the record.
+
+
+def _tones(records: Array, stands_out: float = 40.0, low: int = 4) -> Iterator[DamagedSamples]:
+    """Steady sines of single channels, by lines of a windowed record that linear combinations of the others lack.
+
+    The `low` first lines hold means and drift. A tone stands so many times out of the median power of what is not
+    predicted about it.
+    """
+    channels, n = records.shape
+    lines, width = n // 2, max(64, 6 * channels)
+    if channels < 3 or lines < 2 * width:
+        return
+    size = np.std(records, axis=1, keepdims=True)
+    moving = np.where(size > 0, (records - records.mean(axis=1, keepdims=True)) / np.where(size > 0, size, 1.0), 0.0)
+    spectra = scipy.fft.rfft(moving * np.hanning(n))[:, low:]
+    count = spectra.shape[1] // width
+    blocks = np.moveaxis(spectra[:, : count * width].reshape(channels, count, width), 0, 1)
+    times = _power(_unpredicted(blocks))
+    best, told = times.max(axis=2), set()
+    for block in np.flatnonzero(np.any(best > stands_out, axis=1)):
+        channel = int(np.argmax(best[block]))
+        start = block * width + int(np.argmax(times[block, channel])) - width // 2
+        start = min(max(start, 0), spectra.shape[1] - width)
+        at, place, alone = _tone_at(spectra[:, start : start + width], channel, n, stands_out)
+        line = start + at + low + place
+        if alone and (channel, round(line)) not in told:
+            told.add((channel, round(line)))
+            yield DamagedSamples("tone", channel, np.array([[0, n - 1]]), line / n)
+
+
+def _tone_at(
+    lines: ComplexArray, channel: int, samples: int, stands_out: float, loud: float = 0.01, sine: float = 8.0,
+    elsewhere: float = 15.0,
+) -> tuple[int, float, bool]:  # fmt: skip
+    """Line of a tone of a channel among lines (channels, k), its place from there, and whether it is one, and alone.
+
+    It is `loud` against the channel's rms, beyond what steps make of a sine; it leaves little of the lines about it
+    (`sine`); and without its channel no other stands out as much as `elsewhere`.
+    """
+    blocks = lines[None]
+    times = _power(_unpredicted(blocks))[0, channel]
+    at = int(np.argmax(times))
+    reach = np.arange(max(at - 3, 0), min(at + 4, lines.shape[1]))
+    left = _unpredicted(blocks, np.delete(blocks, reach, axis=2))[0, channel]
+    place, steady = _steady(left[reach], reach - at)
+    size = np.abs(left[at]) / (samples / 4)  # a Hann window's peak of a sine of one
+    others = _power(_unpredicted(np.delete(blocks, channel, axis=1)))[0, :, max(at - 1, 0) : at + 2]
+    stands = times[at] > stands_out and others.max() < elsewhere
+    return at, place, bool(stands and size > loud and steady > sine)
+
+
+def _unpredicted(blocks: ComplexArray, fitted: ComplexArray | None = None) -> ComplexArray:
+    """What each channel has beside a combination of the others, in blocks of lines (k, channels, lines).
+
+    Combinations are those that leave least in the blocks, or in `fitted`, some of their lines.
+    """
+    lines = blocks if fitted is None else fitted
+    gram = lines @ np.conj(np.swapaxes(lines, 1, 2))
+    floor = 1e-6 * np.einsum("kcc->kc", gram).real + np.finfo(float).tiny
+    inverse = np.linalg.inv(gram + floor[..., None] * np.eye(gram.shape[1]))
+    return np.asarray(inverse @ blocks / np.einsum("kcc->kc", inverse)[..., None])
+
+
+def _power(left: ComplexArray) -> Array:
+    """Power of lines (k, channels, lines) over its median in the block."""
+    power = np.abs(left) ** 2
+    return np.asarray(power / np.maximum(np.median(power, axis=2, keepdims=True) / np.log(2), np.finfo(float).tiny))
+
+
+def _steady(lines: ComplexArray, at: Stretches) -> tuple[float, float]:
+    """Place of a steady sine among lines of a Hann window at whole places, and its power over what it leaves."""
+    places = np.linspace(-1, 1, 81)
+    away = at - places[:, None] + 1e-9  # no zero over zero
+    sines = (-1.0) ** at * np.sinc(away) / (1 - away**2)
+    power = np.abs(sines @ lines) ** 2 / np.sum(sines**2, axis=1)
+    best = int(np.argmax(power))
+    left = max(float(np.sum(np.abs(lines) ** 2) - power[best]), np.finfo(float).tiny)
+    return float(places[best]), float(power[best]) / left

@@ -1,0 +1,188 @@
+"""Damaged samples of records that are made by hand: what is told, where, and what sound records have by chance."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import sysid
+from sysid.errors import InputError
+from sysid.measurement.damaged_samples import damaged_samples
+
+N, RATE = 6000, 100.0
+
+
+def moving(seed=0, channels=4, n=N):
+    """Gaussian motion of some eight samples a period, with noise of 1 % of its own in each channel."""
+    rng = np.random.default_rng(seed)
+    low = scipy.signal.butter(4, [0.05, 0.4], "bandpass", output="sos")
+    shared = scipy.signal.sosfilt(low, rng.standard_normal((2, n)), axis=1)
+    records = rng.standard_normal((channels, 2)) @ shared
+    return records + 0.01 * records.std(axis=1, keepdims=True) * rng.standard_normal(records.shape)
+
+
+def rounded(records, bits):
+    step = np.abs(records).max(axis=1, keepdims=True) / 2 ** (bits - 1)
+    return step * np.round(records / step)
+
+
+def told(records, n_base=1):
+    return [(one.kind, one.channel) for one in damaged_samples(records, n_base)]
+
+
+@pytest.mark.parametrize("bits", [8, 12, 24])
+def test_nothing_is_told_of_sound_records_however_coarse_their_steps(bits):
+    assert [told(rounded(moving(seed), bits)) for seed in range(5)] == [[]] * 5
+
+
+@pytest.mark.parametrize("level", [1.0, 2.0, 2.8])
+@pytest.mark.parametrize("bits", [12, 24])
+def test_flat_tops_are_told_with_their_samples_and_level(level, bits):
+    records = rounded(moving(), bits)
+    top = level * records[2].std()
+    beyond = np.flatnonzero(np.abs(records[2]) >= top)
+    np.clip(records[2], -top, top, out=records[2])
+    (one,) = damaged_samples(records, 1)
+    assert (one.kind, one.channel, one.count, one.value) == ("clipped", 2, beyond.size, top)
+    at = np.concatenate([np.arange(first, last + 1) for first, last in one.stretches])
+    np.testing.assert_array_equal(at, beyond)
+
+
+@pytest.mark.parametrize("samples_a_period", [8, 10, 10.3, 40])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_peaks_of_a_steady_sine_are_no_flat_tops(samples_a_period, bits):
+    """A sine in step with the samples has the same values in each period; its tops share a step of 8 bits."""
+    t = np.arange(N) / samples_a_period
+    assert told(rounded(np.array([np.sin(2 * np.pi * t + phase) for phase in (0.0, 0.3, np.pi / 8, 1.0)]), bits)) == []
+
+
+def test_flat_tops_of_a_sine_are_told():
+    t, rng = np.arange(N) / 40, np.random.default_rng(0)
+    records = np.array([np.sin(2 * np.pi * t + phase) for phase in (0.0, 0.3, 0.6, 1.0)])
+    records += 1e-3 * rng.standard_normal(records.shape)
+    np.clip(records[1], -0.8, 0.8, out=records[1])
+    assert told(rounded(records, 16)) == [("clipped", 1)]
+
+
+@pytest.mark.parametrize(("kind", "value"), [("dropout", 0.0), ("held value", None)])
+@pytest.mark.parametrize("first", [0, 2000, N - 40])
+def test_a_gap_and_a_held_value_are_told_with_their_place(kind, value, first):
+    records = moving()
+    value = records[3, first] if value is None else value
+    records[3, first : first + 40] = value
+    (one,) = damaged_samples(records, 1)
+    assert (one.kind, one.channel, one.count, one.value) == (kind, 3, 40, value)
+    np.testing.assert_array_equal(one.stretches, [[first, first + 39]])
+
+
+def test_a_rest_is_no_gap():
+    """A recorder that waits for motion, a base that stops while sensors ring, and a rest between two events."""
+    records = moving()
+    records[:, :900] = records[:, -700:] = 0.0
+    assert told(records) == []
+    records = moving()
+    records[0, 4000:] = 0.0
+    assert told(records) == []
+    assert told(records, n_base=0) == [("dropout", 0)]
+    records = rounded(moving() * (1 - np.exp(-(((np.arange(N) - 3000) / 300.0) ** 4))), 8)
+    assert np.count_nonzero(np.all(records == 0, axis=0)) > 100
+    assert told(records) == []
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_spikes_are_told_one_by_one(width):
+    records = moving()
+    for at in (700, 2500, 2530):
+        records[1, at : at + width] += 6 * records[1].std()
+    (one,) = damaged_samples(records, 1)
+    assert (one.kind, one.channel) == ("spikes", 1)
+    np.testing.assert_array_equal(one.stretches, [[at, at + width - 1] for at in (700, 2500, 2530)])
+    assert one.value == pytest.approx(6 * moving()[1].std(), rel=0.1)
+
+
+def test_a_structure_that_is_hit_has_no_spikes():
+    records = moving()
+    records[:, 3000] += 10 * records.std(axis=1)
+    assert told(records) == []
+
+
+def test_hum_of_one_channel_is_told_with_its_frequency_and_a_tone_of_all_is_not():
+    records = moving()
+    hum = np.sin(2 * np.pi * 0.1234 * np.arange(N))
+    alone = records.copy()
+    alone[2] += 0.1 * records[2].std() * hum
+    (one,) = damaged_samples(alone, 1)
+    assert (one.kind, one.channel) == ("tone", 2)
+    assert one.value == pytest.approx(0.1234, abs=0.1 / N)
+    assert told(records + records.std(axis=1, keepdims=True) * hum) == []
+
+
+def test_equal_channels_are_told_but_a_base_may_move_along_two_axes_alike():
+    records = moving()
+    records[3] = records[1]
+    (one,) = damaged_samples(records, 1)
+    assert (one.kind, one.channel, one.value) == ("equal channels", 3, 1.0)
+    records = moving()
+    records[1] = records[0]
+    assert told(records, n_base=2) == []
+
+
+def run(records):
+    return records[:1], records[1:3], records[3:]
+
+
+def from_time(records, **options):
+    return sysid.Measurement.from_time([run(records)], RATE, rigid_body=[[1.0], [1.0]], **options)
+
+
+def test_a_run_is_cut_at_a_short_gap_and_the_rest_is_kept_to_the_bit():
+    records = moving()
+    records[2, 2000:2030] = 0.0
+    test = from_time(records, at_rest=True, noise=sysid.NoiseLevels([[0.1, 0.2]], [[0.3]], [[0.4]]))
+    pieces = [run(records[:, :2000]), run(records[:, 2030:])]
+    plain = sysid.Measurement.from_time(pieces, RATE, rigid_body=[[1.0], [1.0]])
+    for name in ("freq", "base", "response", "force"):
+        np.testing.assert_array_equal(getattr(test, name), getattr(plain, name))
+    assert test.whole.samples == (2000, N - 2030)
+    assert test.whole.at_rest == (False, False)
+    np.testing.assert_array_equal(test.whole.noise.response, [[0.1, 0.2], [0.1, 0.2]])
+    (one,) = test.damage
+    assert (one.kind, one.run, one.channel, one.count, one.left_out) == ("dropout", 1, "sensor 2", 30, True)
+    np.testing.assert_allclose(one.stretches, [[20.0, 20.29]])
+
+
+def test_damage_is_stored_with_a_measurement():
+    records = moving()
+    records[2, 2000:2030] = 0.0
+    test = from_time(records)
+    again = sysid.Measurement.from_tree(test.to_tree())
+    (one,), (other,) = test.damage, again.damage
+    assert {**vars(one), "stretches": one.stretches.tolist()} == {**vars(other), "stretches": other.stretches.tolist()}
+
+
+@pytest.mark.parametrize("estimator", ["spectra", "h1"])
+def test_averages_and_plain_spectra_are_not_cut(estimator):
+    records = moving()
+    records[2, 2000:2030] = 0.0
+    test = from_time(records, estimator=estimator)
+    assert [(one.kind, one.left_out) for one in test.damage] == [("dropout", False)]
+    np.testing.assert_array_equal(test.freq, from_time(moving(), estimator=estimator).freq)
+
+
+@pytest.mark.parametrize("damage", ["clipped", "equal", "gap"])
+def test_long_damage_is_refused(damage):
+    records = moving()
+    if damage == "clipped":
+        np.clip(records[2], -records[2].std(), records[2].std(), out=records[2])
+    elif damage == "equal":
+        records[2] = records[1]
+    else:
+        records[2, 1000:3500] = 0.0
+    with pytest.raises(InputError):
+        from_time(records)
+
+
+def test_a_short_record_and_one_that_never_moves_are_let_pass():
+    assert told(moving()[:, :10]) == []
+    records = moving()
+    records[2] = 0.0
+    assert told(records) == []
