@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.checks.against_records import exchanged_sensors
+from sysid.assessment.checks.gains import gain_errors
 from sysid.assessment.checks.mistakes import check_records
 from sysid.assessment.checks.model_error import changing
 from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
@@ -106,7 +107,7 @@ def identify(
             follow = strategy == "auto" and not named
             in_turn = InTurn(prepared.screened, session, start, exchanged_sensors, follow)
             outcome, why = in_turn.run(chosen, why)
-            prepared, outcome = within_tolerances(prepared, outcome, chosen, session)
+            prepared, outcome = within_tolerances(prepared, outcome, chosen, session, gain_errors)
             outcome = robust_fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)
         outcome = replace(outcome, findings=(*named, *outcome.findings))

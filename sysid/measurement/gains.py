@@ -3,29 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid.errors import InputError, finite_array
+from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
-
-if TYPE_CHECKING:
-    from sysid.measurement.measurement import Measurement
-
-_MOST = 0.3  # of a gain: a larger tolerance is none, and likely in per cent
-
-
-def tolerances(name: str, given: Any, count: int) -> Array | None:
-    """Stated tolerances of so many gains, (count,); None where none are stated."""
-    if given is None:
-        return None
-    array = finite_array(name, given)
-    if array.shape not in ((), (1,), (count,)):
-        raise InputError(f"{name} has shape {array.shape}; one number, or ({count},), is needed")
-    if np.any((array < 0) | (array > _MOST)):
-        raise InputError(f"{name} is a fraction from 0 to {_MOST:g}, such as 0.005 for half a per cent")
-    return np.broadcast_to(array, (count,)).copy()
 
 
 def tolerance_of(test: Measurement) -> Array:

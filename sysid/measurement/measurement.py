@@ -21,7 +21,6 @@ from sysid.errors import (
 )
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
-from sysid.measurement.gains import tolerances
 from sysid.measurement.spectra import Missing, checked_deviations, checked_lines, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
@@ -32,6 +31,7 @@ from sysid.structure.sensor import (
     motion_of_sensors,
     sensors_from_tree,
     sensors_to_tree,
+    tolerances,
     without_delay,
 )
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -172,7 +172,7 @@ class Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
-        damage = tuple(map(DamagedChannel.from_tree, tree["damage"]))
+        damage = tuple(map(DamagedChannel.from_tree, tree.get("damage", ())))
         given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
         return cls(**{**tree, **given})
 

@@ -11,6 +11,7 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import default_style
+from sysid.report.channels import noise, sensors
 from sysid.report.curves import curves, mode_shape_view
 from sysid.report.html import (
     Cell,
@@ -138,8 +139,8 @@ def render(identification: Identification) -> str:
             ("Total mass", _rigid_body_mass(it)),
             ("Unknowns", _unknowns(it)),
             ("Matrices", matrix_tables(it)),
-            ("Noise", _noise(it)),
-            ("Sensors", _sensors(it)),
+            ("Noise", noise(it)),
+            ("Sensors", sensors(it)),
             ("Outliers", _outliers(it)),
             ("Poles in the data", _poles(it)),
             ("Modal assurance criterion", _mac(it)),
@@ -281,47 +282,12 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
         (one.channel, aligned(100 * one.left), *[aligned(100 * share)] * known, *[aligned(100 * one.beyond)] * beyond)
         for one, share in zip(tables.fit_of_channels(it), noise, strict=True)
     ]
-    caption = (
-        "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
-    )
+    caption = "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of accelerations relative "
     caption += "to the base; and its noise likewise." if known else "to the base."
-    caption += (
-        " Of what was measured, modes beyond the lines, which are kept as residual modes, add the last column." * beyond
-    )
+    caption += " Of what was measured, residual modes, which lie beyond the lines, add the last column." * beyond
     caption += " Outliers that stand alone are left out." * (test is not it.measurement)
     heads = ("channel", "left [%]", *[f"noise{level.bound} [%]"] * known, *["modes beyond [%]"] * beyond)
     return table(heads, rows, caption)
-
-
-def _noise(it: Identification) -> str:
-    """The noise of each channel of whole records."""
-    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in tables.noise_of_channels(it)]
-    caption = (
-        f"Noise of each channel, {tables.noise_source(it)}: standard deviation of a sample in time, of noise up to "
-        "half the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
-    )
-    return table(("channel", *tables.NOISE_COLUMNS), rows, caption)
-
-
-def _sensors(it: Identification) -> str:
-    """The gain of each sensor as the records show it, and its delay."""
-    caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
-    caption += "assume 1. ±: half of the 95 % interval."
-    found = tables.gains_of_sensors(it)
-    priced = it.determined and any(g.worth > 0 for g in found)  # else M_SS has no deviation, or was stated
-    caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
-    if it.modal[0].calibration is not None:
-        caption += " Tolerances are stated: what is likely within them was taken off, and intervals of M, K and C hold "
-        caption += "the rest."
-    late = any(g.delay for g in found)
-    caption += " Delay: by which the records were late, and which was taken off." * late
-    head = ("sensor", "gain", "±", *["delay, ms", "±"] * late, *["1 % moves M_SS by, deviations"] * priced)
-    rows = [
-        (g.sensor, *rounded(g.gain, g.std), *rounded(1e3 * g.delay, 1e3 * g.delay_std) * late,
-         *[number(g.worth, 2)] * priced)
-        for g in found
-    ]  # fmt: skip
-    return table(head, rows, caption)
 
 
 def _outliers(it: Identification) -> str:

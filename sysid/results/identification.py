@@ -224,15 +224,8 @@ class Identification(Answer):
                 for c in noise_of_channels(self)
             ],
             "gains": [
-                {
-                    "sensor": g.sensor,
-                    "gain": g.gain,
-                    "std": g.std,
-                    "delay": g.delay,
-                    "delay_std": g.delay_std,
-                    "deviations_per_percent": _plain(np.array(g.worth)),
-                }
-                for g in gains_of_sensors(self)
+                {**one.to_tree(), "deviations_per_percent": _plain(np.array(one.worth))}
+                for one in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),
             "leaders_tried": int(self.history.leaders_tried),

@@ -76,6 +76,10 @@ class SensorGain(NamedTuple):
     delay: float = 0.0
     delay_std: float = 0.0
 
+    def to_tree(self) -> dict[str, str | float]:
+        """Give the fields by their names, but for what it is worth."""
+        return {name: value for name, value in self._asdict().items() if name != "worth"}
+
 
 def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
     """Gains of the sensors that the records of a fit show; of none where deviations take long or nothing was fitted."""

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks.gains import gain_errors
 from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
 from sysid.modal_analysis.fit import of_calibrated_lines
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
@@ -135,16 +136,29 @@ class InTurn:
 _GAINS = "gains within tolerances"  # the phase of the fit without their errors
 
 
+class ShownGains(Protocol):
+    """Errors of the sensors' gains against the base that a test shows, and their deviations, (n_sensors,)."""
+
+    @property
+    def error(self) -> Array:
+        """NaN where none is shown."""
+
+    @property
+    def std(self) -> Array:
+        """Likewise."""
+
+
 def within_tolerances(
-    problem: Prepared, end: Outcome, strategy: Strategy, session: Session
-) -> tuple[Prepared, Outcome]:
+    problem: Prepared, end: Outcome, strategy: Strategy, session: Session,
+    shown: Callable[[ModalEstimate, Structure], ShownGains],
+) -> tuple[Prepared, Outcome]:  # fmt: skip
     """The problem and where its search ended, without the errors of gains that spectra and tolerances make likely.
 
-    Those of whole records were taken off with the fit of their modes.
+    Those of whole records were taken off with the fit of their modes. `shown` gives what a fit shows of gains.
     """
     modal, fits = list(problem.modal), problem.screened.fits(end.structure, end.x)
     asked = [
-        (at, one.calibration, gain_errors(one, its))
+        (at, one.calibration, shown(one, its))
         for at, (one, its) in enumerate(fits, start=problem.first_test - 1)
         if one.calibration is not None and not one.of_records
     ]

@@ -289,3 +289,18 @@ def _check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequenc
             f"{rows[i, j]:.3g} for unit {names[j]} of the base, in place of {wanted[i, j]:.3g}: correct axis, row or "
             "base_axes"
         )
+
+
+def tolerances(name: str, given: Any, count: int, most: float = 0.3) -> Array | None:
+    """Stated tolerances of so many gains, (count,); None where none are stated.
+
+    One beyond `most` is none, and likely in per cent.
+    """
+    if given is None:
+        return None
+    array = finite_array(name, given)
+    if array.shape not in ((), (1,), (count,)):
+        raise InputError(f"{name} has shape {array.shape}; one number, or ({count},), is needed")
+    if np.any((array < 0) | (array > most)):
+        raise InputError(f"{name} is a fraction from 0 to {most:g}, such as 0.005 for half a per cent")
+    return np.broadcast_to(array, (count,)).copy()

@@ -27,11 +27,9 @@ from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
-_USUAL = 0.015  # of a gain; the tolerance of an accelerometer is a third of it
 _UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
-_DRIVEN = 0.5  # of a sensor's motion with the base, along one of its directions
 _BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors, as poles follow it
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
 NUMBERS_A_RESIDUE = 2  # times the free residues: fewer numbers than these tell nothing beside noise
@@ -206,14 +204,15 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _within(error: float) -> str:
-    """The remedy beside others of an error that is a usual tolerance."""
-    return ", or state its tolerance (gain_std, --gain-std 0.005)" if abs(error) < _USUAL else ""
+def _within(error: float, usual: float = 0.015) -> str:
+    """The remedy beside others of an error that is usual of accelerometers."""
+    return ", or state its tolerance (gain_std, --gain-std 0.005)" if abs(error) < usual else ""
 
 
 def _driven(test: Measurement, axis: int) -> NDArray[np.bool_]:
-    """Sensors that move with the base mostly along one of its directions, (n_sensors,)."""
-    return np.asarray(-seen_at_sensors(test)[:, test.n_sensors + axis] > _DRIVEN)
+    """Sensors that move with the base by one of its directions more than by all others, (n_sensors,)."""
+    of_base = -seen_at_sensors(test)[:, test.n_sensors :]
+    return np.asarray(of_base[:, axis] > of_base.sum(axis=1) / 2)
 
 
 def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.bool_]) -> Finding:
