@@ -335,7 +335,8 @@ COMMANDS = {
     "run --resume out": "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there, and goes on with "
     "it where there is one",
     "run idle.py --resume out --fresh": "--resume and --fresh exclude each other",
-    "run shear_building --goal 0.1": "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote",
+    "run shear_building --goal 0.1": "--mass, --lumped, --band, --goal and --gain-std are for a test that "
+    "'sysid read' wrote",
     "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
 }
 
@@ -385,7 +386,8 @@ FOUND = [
         "low gain", "gain",
         lambda of: f"sensor 2 reads 0.44 % low against the base (standard deviation {100 * of['std']:.1g} %): M_SS, "
         "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956 (gain = 0.9956 in "
-        "sensors.toml), or correct its axis or its row of rigid_body",
+        "sensors.toml), or correct its axis or its row of rigid_body, or state its tolerance (gain_std, --gain-std "
+        "0.005)",
     ),
     (
         "late", "late sensor",

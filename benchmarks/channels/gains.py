@@ -106,7 +106,7 @@ def one_test(task: tuple[str, int]) -> Found:
         determined = result.determined if least.of_mass < MASS else None
         inside = {} if mine is None else intervals_held(result, least, mine)
         return Found(name, case, None, determined, accusations(result), inside, said)
-    told = {one.channel for one in result.findings if one.kind == "gain"}
+    told = {one.channel for one in result.contradictions}
     at = [wrong] if case != "base" else np.flatnonzero(np.abs(test.rigid_body[:, axis]) > 0.7)
     closely = len(at) > 0 and np.sum(known[at] ** -2.0) ** -0.5 < KNOWN and (case != "base" or len(at) > 2)
     return Found(name, case, channel in told if closely else None, None, [], {}, said)

@@ -123,11 +123,15 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
 def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Array | None]:
     """Tolerances of the gains of base and force in each direction, (d,), by their names in `RecordedTest`.
 
-    Several sensors of the base, each independent of the others, share theirs; of load cells the largest is that of all.
+    Several sensors of the base, each independent of the others, share theirs: each counts by its part of the base's
+    motion. Of load cells the largest is that of all.
     """
     base = [(channel, channel.gain_std) for channel in said.channels if channel.role == "base"]
     force = [channel.gain_std for channel in said.channels if channel.role == "force"]
-    share = np.linalg.pinv(_motions(base, said, axes)) if any(std for _, std in base) else None
+    share = None
+    if any(std for _, std in base):
+        moved = _motions(base, said, axes)
+        share = np.linalg.pinv(moved) * moved.T
     return {
         "base_gain_std": None if share is None else np.sqrt(share**2 @ np.array([std**2 for _, std in base])),
         "force_gain_std": np.full(len(axes), max(force)) if any(force) else None,

@@ -221,8 +221,8 @@ def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> Stated
         if isinstance(given, FurtherTest):
             term = next(tests)
             structure = term.matrices.structure(x, term.test)
-            drawn, delays = _again(term.test, structure, problem.n_variables, rng), next(modal).delays
-            again = replace(given, measurement=drawn if delays is None else without_delays(drawn, -delays.values))
+            drawn = _as_recorded(_again(term.test, structure, problem.n_variables, rng), next(modal), rng)
+            again = replace(given, measurement=drawn)
         else:
             _, value, std = given.column("Prior")
             at = value + std * next(priors).numbers(x)
@@ -258,7 +258,13 @@ def _test_again(modal: ModalEstimate, structure: Structure, unknowns: int, rng: 
         again = _again(modal.records, structure, unknowns, rng)
     else:
         again = _whole_again(modal, modal.noise, structure, rng)
-    return again if modal.delays is None else without_delays(again, -modal.delays.values)  # which each draw finds anew
+    return _as_recorded(again, modal, rng)
+
+
+def _as_recorded(test: Measurement, modal: ModalEstimate, rng: np.random.Generator) -> Measurement:
+    """The test with errors of gains within tolerances, and its delays: each draw finds them anew."""
+    test = test if modal.calibration is None else modal.calibration.recorded(test, rng)
+    return test if modal.delays is None else without_delays(test, -modal.delays.values)
 
 
 def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid import catalogue
 from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.gains import gain_errors
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
@@ -22,7 +23,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
-from sysid.search.auto import robust_fit
+from sysid.search.auto import robust_fit, within_tolerances
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import fit_records_as_asked
 from sysid.search.session import DeferredInterrupt, Session
@@ -124,9 +125,8 @@ def _identified(job: Job, session: Session) -> JobResult:
     if job.recipe.start is not None and from_start:
         prepared = changed.prepared
         x = as_unknowns(prepared, np.array(job.recipe.start))
-        result = judge(
-            changed, prepared, _descended(prepared, x, [], session), "from the result's unknowns", job.seed, session
-        )
+        prepared, end = _descended(prepared, x, [], session)
+        result = judge(changed, prepared, end, "from the result's unknowns", job.seed, session)
     else:
         there = changed.measurement.sensor_names
         asked = replace(job.recipe, sensors=tuple(name for name in job.recipe.sensors if name in there))
@@ -168,6 +168,8 @@ def _refined(job: Job, session: Session) -> JobResult:
     if from_recipe:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
+            if any(one.calibration is not None for one in problem.modal):
+                problem, _ = _descended(problem, x, [], session)  # without errors of gains
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
             fitted = problem if problem.in_squares else problem.pseudo_values(problem.structure(x), x)
             problem = _as_asked(Prepared(drawn(fitted, x, np.random.SeedSequence(job.seed))), bare)
@@ -177,23 +179,26 @@ def _refined(job: Job, session: Session) -> JobResult:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    end = _descended(problem, x, [] if from_recipe else _widened(bare, job.source), session)
+    problem, end = _descended(problem, x, [] if from_recipe else _widened(bare, job.source), session)
     assert end.x is not None
     verdict = verdict_of(Context(problem, end))
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
 
 
-def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
-    """Where the local phase ends from `x`."""
+def _descended(
+    problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session
+) -> tuple[Prepared, Outcome]:
+    """Where the local phase ends from `x`, and of what problem: without errors of gains within tolerances."""
     answer = descend(problem.screened, x, steps, session)
     if answer.stopped is not None:
         raise answer.stopped
     structure = problem.structure(answer.x)
     end = Outcome(structure, answer.x, "local phase", answer.success, answer.message, History(), None)
+    problem, end = within_tolerances(problem, end, Continuation(), session, gain_errors)
     end = robust_fit(problem, end, Continuation(), session)
     if end.stopped is not None:
         raise end.stopped
-    return end
+    return problem, end
 
 
 @lru_cache(maxsize=_BUILT)

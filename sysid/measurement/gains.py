@@ -19,10 +19,10 @@ def tolerance_of(test: Measurement) -> Array:
 def seen_at_sensors(test: Measurement) -> Array:
     """What each gain's error makes of the sensors' gains against the base, (n_sensors, n_sensors + 2 d).
 
-    A sensor that moves with several base directions counts each by the power that it gets from it.
+    A sensor that moves with several base directions counts each by its part along the sensor's whole motion with them.
     """
     n, d = test.rigid_body.shape
-    power = test.rigid_body**2 * np.sum(np.abs(test.base) ** 2, axis=(0, 2))
+    power = test.rigid_body * (test.rigid_body @ np.einsum("rif,rjf->ij", test.base, test.base.conj()).real)
     share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
     return np.hstack([np.eye(n), -share, np.zeros((n, d))])
 
@@ -62,6 +62,6 @@ def without_gains(test: Measurement, errors: Array) -> Measurement:
     read = lambda record, gain: None if record is None else record * run / gain  # noqa: E731
     return replace(
         test, response=test.response * run / sensors, base=test.base / base, force=read(test.force, force),
-        response_std=read(test.response_std, sensors), force_std=read(test.force_std, force),
+        response_std=read(test.response_std, np.abs(sensors)), force_std=read(test.force_std, np.abs(force)),
         gain_std=np.zeros(n), base_gain_std=np.zeros(d), force_gain_std=np.zeros(d),
     )  # fmt: skip

@@ -12,6 +12,7 @@ from sysid.errors import refuse
 from sysid.measurement.gains import seen_at_sensors, tolerance_of, without_gains
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import most_deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,20 @@ class Calibration:
         std = tolerance_of(test)
         return cls(std, np.zeros(std.size), np.diag(std**2)) if np.any(std) else None
 
+    def seen(self, test: Measurement) -> Array:
+        """What was taken off the sensors' gains against the base, (n_sensors,)."""
+        n, d = test.rigid_body.shape
+        of_base = seen_at_sensors(test)[:, n : n + d] @ -self.values[n : n + d]
+        return np.asarray((1 + self.values[:n]) / (1 + of_base) - 1)
+
+    def recorded(self, test: Measurement, rng: np.random.Generator) -> Measurement:
+        """The test as channels with other errors within the tolerances record it, which it states again."""
+        n, d = test.rigid_body.shape
+        errors = self.tolerance * rng.standard_normal(self.tolerance.size)
+        sensors, base, force = np.split(self.tolerance, [n, n + d])
+        given = without_gains(test, 1 / (1 + errors) - 1)
+        return replace(given, gain_std=sensors, base_gain_std=base, force_gain_std=force)
+
     def taken_off(self, test: Measurement) -> Measurement:
         """The test without these errors."""
         return without_gains(test, self.values) if np.any(self.values) else test
@@ -45,10 +60,14 @@ class Calibration:
     def given(self, test: Measurement, error: Array, std: Array) -> Calibration:
         """The same beside errors of the sensors' gains against the base that records show, (n_sensors,), NaN for none.
 
-        Both are normally distributed: the likeliest errors are linear in what is shown.
+        Both are normally distributed: the likeliest errors are linear in what is shown. Sensors that are wrong beyond
+        both tell nothing of the others.
         """
+        H = seen_at_sensors(test)
+        chance = np.sqrt(std**2 + np.einsum("ik,kl,il->i", H, self.covariance, H))
         known = np.isfinite(error) & np.isfinite(std)
-        H = seen_at_sensors(test)[known]
+        known &= np.abs(np.nan_to_num(error)) < most_deviations(error.size) * np.nan_to_num(chance)
+        H = H[known]
         across = self.covariance @ H.T
         gain = across @ np.linalg.pinv(H @ across + np.diag(std[known] ** 2), hermitian=True)
         return replace(

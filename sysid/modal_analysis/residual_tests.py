@@ -30,7 +30,7 @@ from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeli
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, score, unit_diagonal
 from sysid.modal_analysis.record_model import Parameters, Run
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance, most_deviations
 
 _FEWEST = 8  # lines of a band
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
@@ -326,7 +326,7 @@ def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:
     """Errors of gains by a step of all unknowns from the end of a fit, beside their tolerances, and what is left.
 
     What modes above the lines make is asked for too. What the model misses beyond the noise counts as noise of the
-    records, beside which tolerances weigh more.
+    records, beside which tolerances weigh more. Sensors that are wrong beyond both tell nothing of the others.
     """
     model, n, d = fit.model, fit.model.n, fit.model.d
     own, above = np.r_[model.of_gains], np.arange(model.n_fit + n * d, fit.asked.delays)
@@ -339,13 +339,19 @@ def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:
     seen = (normal[at:, at:] - across.T @ across) * np.outer(size[at:], size[at:])  # tolerances included
     step = np.linalg.solve(seen, size[at:] * (gradient[at:] - across.T @ (half.T @ gradient[:at])))
     of_records, found = seen - np.eye(own.size) / 2, fit.parameters.gains + step
-    weight = 2 / max(fit.reduced, 1.0)
-    covariance = np.linalg.inv(weight * of_records + np.eye(own.size))
-    told = np.flatnonzero(stated.tolerance)[: own.size]
+    weight, told = 2 / max(fit.reduced, 1.0), np.flatnonzero(stated.tolerance)[: own.size]
+    of_records, pulled, held = weight * of_records, weight * (of_records @ found + found / 2), np.ones(own.size)
+    while True:  # an error is off by its mean over the root of what records take away of its variance, one before them
+        covariance = np.linalg.inv(of_records + np.diag(held))
+        shown = np.where((told < n) & (held == 1), 1 - np.diag(covariance), 0.0)
+        off = np.abs(covariance @ pulled) / np.sqrt(np.where(shown > ROUND_OFF, shown, np.inf))
+        if off.max(initial=0.0) < most_deviations(n):
+            break
+        held[np.argmax(off)] = 0.0
+    right, scale = held == 1, stated.tolerance[told]
     values, left = np.zeros(stated.values.size), np.diag(stated.tolerance**2)
-    scale = stated.tolerance[told]
-    values[told] = scale * (covariance @ (weight * (of_records @ found + found / 2)))
-    left[np.ix_(told, told)] = scale[:, None] * covariance * scale
+    values[told[right]] = (scale * (covariance @ pulled))[right]
+    left[np.ix_(told[right], told[right])] = (scale[:, None] * covariance * scale)[np.ix_(right, right)]
     return replace(stated, values=values, covariance=left)
 
 

@@ -171,4 +171,7 @@ def _as_test(
         return None
     whole = WholeRecords(samples, rate, (False,) * len(pieces), noise)
     given = (freq[inside], base[..., inside], response[..., inside])
-    return Measurement(*given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole)
+    return Measurement(
+        *given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole,
+        gain_std=np.zeros(test.n_sensors),
+    )  # fmt: skip

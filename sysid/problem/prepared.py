@@ -200,8 +200,9 @@ class Prepared(SearchSpace):
 
     @cached_property
     def validation(self) -> tuple[Measurement, ...]:
-        """Tests that are predicted and never fitted, without delays of their own."""
-        return tuple(Clock.of(test).test for test in self.stated.validation)
+        """Tests that are predicted and never fitted, without delays of their own, and without errors of gains."""
+        gains, tests = self.modal[0].calibration, (Clock.of(test).test for test in self.stated.validation)
+        return tuple(test if gains is None else gains.taken_off(test) for test in tests)
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:

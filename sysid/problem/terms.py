@@ -7,7 +7,7 @@ The objective is the sum of squares of all rows of all terms. A term of a new ki
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -117,7 +117,8 @@ class TestTerm:
     @cached_property
     def estimate(self) -> ModalEstimate:
         """The estimate of its modes; of lines alone where modes beyond them are fitted, which are not told there."""
-        return ModalEstimate.of_lines(self.test) if self.matrices.beyond.omega.size else self.modal
+        lines = replace(ModalEstimate.of_lines(self.test), calibration=self.modal.calibration)
+        return lines if self.matrices.beyond.omega.size else self.modal
 
     @cached_property
     def batch(self) -> TestObjective:

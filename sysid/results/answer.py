@@ -255,9 +255,13 @@ class Answer:
 
     @cached_property
     def validation(self) -> tuple[Measurement, ...]:
-        """The problem's validation tests without their delays; of whole records without this structure's transients."""
-        clocks = map(Clock.of, self.records.validation)
-        return tuple(without_transients_of(clock.test, self.structure) for clock in clocks)
+        """The problem's validation tests without their delays; of whole records without this structure's transients.
+
+        Without errors of gains, which are those of the sensors of the problem's own test.
+        """
+        gains, clocks = self.modal[0].calibration, map(Clock.of, self.records.validation)
+        tests = (clock.test if gains is None else gains.taken_off(clock.test) for clock in clocks)
+        return tuple(without_transients_of(test, self.structure) for test in tests)
 
     @property
     def _in_modes(self) -> bool:

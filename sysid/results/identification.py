@@ -342,8 +342,9 @@ class Identification(Answer):
         else:
             tree, tests = self.part.tree, [self.part.records.measurement.to_tree()]
         given = [to_bytes(test.to_tree(), 0) for test in problem.tests]
-        known = dict(zip((to_bytes(test, 0) for test in tests), tree.get("fits") or (), strict=False))
-        return {**tree, "fits": [known.get(test) for test in given]}
+        names, were = ("fits", "delays", "calibrations"), [to_bytes(test, 0) for test in tests]
+        known = {name: dict(zip(were, tree.get(name) or (), strict=False)) for name in names}
+        return {**tree, **{name: [known[name].get(test) for test in given] for name in names}}
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:

@@ -150,31 +150,39 @@ class ShownGains(Protocol):
 
 def within_tolerances(
     problem: Prepared, end: Outcome, strategy: Strategy, session: Session,
-    shown: Callable[[ModalEstimate, Structure], ShownGains],
+    shown: Callable[[ModalEstimate, Structure], ShownGains], rounds: int = 4,
 ) -> tuple[Prepared, Outcome]:  # fmt: skip
     """The problem and where its search ended, without the errors of gains that spectra and tolerances make likely.
 
-    Those of whole records were taken off with the fit of their modes. `shown` gives what a fit shows of gains.
+    Those of whole records were taken off with the fit of their modes. `shown` gives what a fit shows of gains: its
+    poles hold what is wrong with them, so that a few rounds are needed where these are not free.
     """
-    modal, fits = list(problem.modal), problem.screened.fits(end.structure, end.x)
-    asked = [
-        (at, one.calibration, shown(one, its))
-        for at, (one, its) in enumerate(fits, start=problem.first_test - 1)
-        if one.calibration is not None and not one.of_records
-    ]
-    if end.stopped is not None or not asked:
-        return problem, end
-    for at, stated, found in asked:
-        likely = stated.given(modal[at].records, found.error, found.std)
-        modal[at] = of_calibrated_lines(modal[at], likely)
-    try:
-        other = Prepared(problem.stated, modal, in_squares=problem.in_squares)
-        again = _fitted(other.screened, end, strategy, session)
-    except (Stop, KeyboardInterrupt) as stop:
-        return problem, _cut_short(end, str(stop) or "interrupted", stop)
-    except (InputError, SolverError) as error:
-        return problem, _cut_short(end, f"the fit without errors of gains came to nothing: {error}")
-    return other, _with_round(other.screened, replace(end, findings=again.findings), again, session, _GAINS)
+    first, near = problem.modal, 0.1  # of its deviation, that an error still moves by
+    for _ in range(rounds):
+        if end.stopped is not None or problem.stopped or all(one.calibration is None for one in first):
+            break
+        modal, moved = list(first), 0.0
+        for at, (one, its) in enumerate(problem.screened.fits(end.structure, end.x), start=problem.first_test - 1):
+            if one.calibration is None or one.of_records:
+                continue
+            stated, found = first[at].calibration, shown(one, its)
+            assert stated is not None
+            likely = stated.given(one.records, found.error, found.std)
+            modal[at] = of_calibrated_lines(first[at], likely)
+            std = np.sqrt(np.maximum(np.diag(likely.covariance), np.finfo(float).tiny))
+            moved = max(moved, float(np.max(np.abs(likely.values - one.calibration.values) / std)))
+        if moved < near:
+            break
+        try:
+            other = Prepared(problem.stated, modal, in_squares=problem.in_squares)
+            again = _fitted(other.screened, end, strategy, session)
+        except (Stop, KeyboardInterrupt) as stop:
+            return problem, _cut_short(end, str(stop) or "interrupted", stop)
+        except (InputError, SolverError) as error:
+            return problem, _cut_short(end, f"the fit without errors of gains came to nothing: {error}")
+        end = _with_round(other.screened, replace(end, findings=again.findings), again, session, _GAINS)
+        problem = other
+    return problem, end
 
 
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good

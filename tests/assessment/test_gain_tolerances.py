@@ -7,7 +7,9 @@ import pytest
 
 import sysid
 from sysid import Problem, Sensor, Structure, simulate
+from sysid.assessment.checks.gains import GainErrors
 from sysid.assessment.uncertainty import moves_by_records
+from sysid.jobs.changes import drawn_from
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.fit import whole_fit
@@ -133,14 +135,63 @@ def test_intervals_hold_tolerances_and_nobody_is_accused(spectra, records, kind,
 def test_gains_beyond_tolerances_are_named(spectra):
     errors = np.array([0.003, 0.05, -0.004, 0.002, 0.003, 0.0])
     result = sysid.identify(Problem(dataclasses.replace(misread(spectra, errors), **TOLERANCES)), rng=0)
-    (told,) = [one for one in result.findings if one.kind == "gain"]
-    assert told.channel == "sensor 2" and told.numbers["gain"] == pytest.approx(1.05, abs=0.01)
+    (told,) = result.contradictions
+    assert told.channel == "sensor 2" and told.kind in ("gain", "rigid motion")
+    assert result.gains.error[1] == pytest.approx(0.05, abs=0.01)
+    # It tells nothing of the others, of which what is likely was taken off.
+    assert np.all(np.abs(result.modal[0].calibration.values) < 0.009) and result.modal[0].calibration.values[1] == 0
+
+
+@pytest.mark.parametrize("kind", ["spectra", "records"])
+def test_a_sensor_of_the_other_sign_tells_nothing_of_the_others(spectra, records, kind):
+    test = {"spectra": spectra, "records": records}[kind]
+    wrong = dataclasses.replace(misread(test, -2.0 * np.eye(6)[2]), **TOLERANCES)
+    result = sysid.identify(Problem(wrong), rng=0)
+    assert np.all(np.abs(result.modal[0].calibration.values) < 0.006)
+    assert [one.channel for one in result.contradictions if one.channel] == ["sensor 3"]
+
+
+def test_a_written_model_finds_errors_of_gains_in_a_few_rounds():
+    """Its poles hold what wrong gains do to it, so that one round leaves some of them."""
+    K = np.array([[8000.0, -4000, 0], [-4000, 7000, -3000], [0, -3000, 3000]])
+    whole = np.block([[K, -K.sum(axis=1)[:, None]], [-K.sum(axis=1)[None], np.array([[K.sum()]])]])
+    truth = Structure(np.diag([5.0, 4.0, 3.0, 0.0]), whole, [0.01, 0.01, 0.01], n_base=1)
+    test = simulate(truth, np.linspace(1.0, 9.0, 300), noise=1e-3, rng=2)
+    errors = np.array([0.01, -0.01, 0.012, 0.0, 0.0])
+    springs = sysid.ChainStiffness(1e3, 1e4)
+    given = dataclasses.replace(misread(test, errors), gain_std=0.01)
+    result = sysid.identify(Problem(given, mass=sysid.LumpedMass(12.0), stiffness=springs), rng=0)
+    assert result.residual < 1.5e-3 and not result.contradictions
+    np.testing.assert_allclose(result.modal[0].calibration.values[:3], errors[:3], atol=0.003)
+
+
+def test_draws_hold_errors_of_gains(spectra):
+    """The scatter of a force's gain is that of M, which no record shows otherwise."""
+    given = dataclasses.replace(spectra, force_gain_std=0.05)
+    result = sysid.identify(Problem(given), rng=0)
+    found = [
+        sysid.identify(drawn_from(result, np.random.SeedSequence(seed)), rng=0).structure.mass[0, 0]
+        for seed in range(12)
+    ]
+    assert 0.5 < np.std(found) / (0.05 * 4.0) < 1.6
 
 
 def test_one_error_of_all_sensors_is_the_bases(spectra):
     result = sysid.identify(Problem(misread(spectra, ERROR * np.eye(6)[4])), rng=0)
     (told,) = [one for one in result.findings if one.kind == "gain"]
     assert told.channel == "base x" and told.numbers["gain"] == pytest.approx(1 + ERROR, abs=2e-3)
+
+
+def test_one_wrong_sensor_is_no_table_that_rocks():
+    """Nor one of the base, whichever is known best."""
+    sensors = [Sensor(f"floor {i}", (0.0, 0.0, z), "x") for i, z in enumerate((0.0, 0.0, 0.0, 3.0), start=1)]
+    truth = frame(sensors)
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.3 * f[0], 1.4 * f[-1], 300), noise=0.001, rng=4, base_axes="x")
+    found = sysid.identify(Problem(misread(test, np.array([0, 0, 0, ERROR, 0, 0]))), rng=0).findings
+    assert [one.channel for one in found if one.kind in ("gain", "table rocks")] == ["floor 4"]
+    errors = GainErrors(np.array([0.05, 0.002, -0.001]), np.array([0.002, 0.03, 0.03]), np.zeros(3), 500, np.zeros(3))
+    assert errors.of_base() is None and errors.wrong.tolist() == [0]
 
 
 def test_a_table_that_rocks_is_told():

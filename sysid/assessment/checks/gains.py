@@ -45,8 +45,8 @@ class GainErrors:
         Of the gain against the base's, as a fraction, and its standard deviation; NaN where the records cannot show it:
         the sensor's row of G is zero, or modes answer like a constant.
     possible : (n_sensors,)
-        Error that the gain may well have, though it may be chance; zero where nothing speaks for one, or a tolerance is
-        stated, which then stands for it.
+        Error that the gain may well have, beside what was taken off within tolerances, though it may be chance; zero
+        where nothing speaks for one.
     freedom : int
         Degrees of freedom of the standard deviations.
     tolerance : (n_sensors,)
@@ -72,16 +72,19 @@ class GainErrors:
     def of_base(self, driven: NDArray[np.bool_] | None = None) -> float | None:
         """The one error that explains those of all sensors, or of those `driven` by a base direction, (n_sensors,).
 
-        Where three or more show one, beyond chance and tolerances: then it is the base's.
+        Where three or more show one, beyond chance and tolerances without any one of them too: then it is the base's.
         """
         known = np.isfinite(self.error) & (True if driven is None else driven)
         if np.count_nonzero(known) < 3 or not np.any(known[self.wrong]):
             return None
         error, std = self.error[known], np.hypot(self.std, self.tolerance)[known]
-        one, chance = float(np.average(error, weights=std**-2)), float(np.sum(std**-2.0) ** -0.5)
-        likely = most_deviations(error.size)
+        likely, one = most_deviations(error.size), float(np.average(error, weights=std**-2))
         alike = np.all(np.abs(error - one) < likely * std)
-        return one if alike and abs(one) > likely * np.hypot(chance, self.tolerance[known].min()) else None
+        weight = std**-2.0
+        size = np.append(weight.sum(), weight.sum() - weight)  # of all, and without each
+        without = np.append(one, (np.sum(weight * error) - weight * error) / size[1:])
+        shown = np.abs(without) > likely * np.hypot(size**-0.5, self.tolerance[known].min())
+        return one if alike and np.all(shown) else None
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -96,11 +99,9 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     found, calibration = _shown(modal, structure), modal.calibration
     if calibration is None:
         return found
-    H = seen_at_sensors(modal.records)
-    taken, tolerance = H @ calibration.values, np.sqrt(H**2 @ calibration.tolerance**2)
-    return replace(
-        found, error=found.error + taken, tolerance=tolerance, possible=np.where(tolerance > 0, 0.0, found.possible)
-    )
+    H, taken = seen_at_sensors(modal.records), calibration.seen(modal.records)
+    tolerance = np.sqrt(H**2 @ calibration.tolerance**2)
+    return replace(found, error=(1 + found.error) * (1 + taken) - 1, tolerance=tolerance)
 
 
 def _shown(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -235,7 +236,7 @@ def rocking_table(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
             yield from _rocking(test, errors, axis)
 
 
-def _rocking(test: Measurement, errors: GainErrors, axis: int) -> Iterator[Finding]:
+def _rocking(test: Measurement, errors: GainErrors, axis: int, most: float = 0.5) -> Iterator[Finding]:
     known = _driven(test, axis) & np.isfinite(errors.error)
     if test.sensors is None or np.count_nonzero(known) < 3 or not np.any(known[errors.wrong]):
         return
@@ -243,12 +244,14 @@ def _rocking(test: Measurement, errors: GainErrors, axis: int) -> Iterator[Findi
     error, std = errors.error[known], np.hypot(errors.std, errors.tolerance)[known]
     for turn in [name for name in BASE_AXES[3:] if name not in test.base_axes]:
         arm = rows[known, BASE_AXES.index(turn)] / test.rigid_body[known, axis]
-        size = float(np.sum((arm / std) ** 2))
         if np.ptp(arm) <= NEGLIGIBLE * np.abs(arm).max(initial=0.0):
             continue  # as of one error of all
-        slope = float(np.sum(arm * error / std**2)) / size
-        likely = most_deviations(error.size)
-        if np.all(np.abs(error - slope * arm) < likely * std) and abs(slope) * np.sqrt(size) > likely:
+        weight, likely = (arm / std) ** 2, most_deviations(error.size)
+        size, slope = float(weight.sum()), float(np.sum(arm * error / std**2) / weight.sum())
+        # Without any one sensor too, which might be wrong by itself.
+        others = (np.sum(arm * error / std**2) - arm * error / std**2) / np.sqrt(np.maximum(size - weight, 1e-300))
+        alike = np.all(np.abs(error - slope * arm) < likely * std)
+        if alike and np.all(np.abs(others) > likely) and np.abs(slope * arm).max() < most:
             yield Finding(
                 "table rocks", Severity.CONTRADICTS,
                 f"the sensors' gains against the base {test.base_axes[axis]} rise with their places: your table rocks "
