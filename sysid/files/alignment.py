@@ -44,11 +44,12 @@ def clock_moves(units: Sequence[UnitColumns], said: Description) -> tuple[Array,
     Raises
     ------
     InputError
-        Where the records of a unit do not show when the base moved.
+        Where no unit has the base, or the records of a unit do not show when it moved.
     """
     axes = {str(one.column): str(one.axis or "").lstrip("+-") for one in said.channels}
     base = [str(one.column) for one in said.channels if one.role == "base"]
-    first = next((at for at, unit in enumerate(units) if any(one.name in base for one in unit.columns)), 0)
+    first = next((at for at, unit in enumerate(units) if any(one.name in base for one in unit.columns)), -1)
+    refuse((first < 0, "no file has the base's column under the name that is stated; --align needs it by its name"))
     rate, reference = min(unit.rate for unit in units), units[first]
     others = [unit for at, unit in enumerate(units) if at != first]
     pairs = [_clearest(reference, unit, axes, rate) for unit in others]

@@ -337,6 +337,8 @@ def _begins(
         )
         clocks.append(UnitColumns(recording.path.name, begin, rate, part))
     rates = [clock.rate for clock in clocks]
+    empty = [str(recording.path) for recording, part in zip(recordings, parts, strict=True) if not part]
+    refuse((empty, f"{', '.join(empty)}: no column is described, so that it cannot be aligned (--align): leave it out"))
     longest = max(part[0].values.size for part in parts)
     words = (
         f"{recordings[0].path}: the files of its folder have rates of {min(rates):g} to {max(rates):g} Hz: bring them"

@@ -11,7 +11,6 @@ from scipy.linalg import block_diag
 from sysid import Continuation, FullMass, InputError, LumpedMass, Measurement, Problem, Structure, identify, simulate
 from sysid.modal_analysis.residues import Records, line_correlation
 
-pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 FREQ = np.linspace(2.0, 30.0, 500)
 
 

@@ -35,6 +35,18 @@ def file(truth, tmp_path_factory):
     return str(path)
 
 
+def test_tolerances_of_all_gains_at_the_command_line(folder, file, capsys):
+    assert cli.main(["run", file, "--gain-std", "0.004", "--out", "within"]) == 0
+    result = sysid.load("within")
+    assert result.modal[0].calibration.tolerance.tolist() == [0.004] * 5
+    least = 0.004 * np.diag(result.structure.mass)[: result.structure.n]  # of the force's gain alone
+    assert np.all(np.diag(result.uncertainty.mass) > least)
+    capsys.readouterr()
+    assert cli.main(["run", file, "--gain-std", "5"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "gain_std" in told
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch, no_pictures):
     monkeypatch.chdir(tmp_path)

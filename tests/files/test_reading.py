@@ -269,11 +269,31 @@ def test_gain_and_delay_are_stated_at_the_command_line_too(tmp_path, monkeypatch
     np.testing.assert_allclose(recorded_test.load("test.h5").runs[0][1][0], records()[2][1] / 0.8, rtol=1e-10)
     assert cli.main([*words, "delay=-0.01"]) == 0
     np.testing.assert_allclose(recorded_test.load("test.h5").runs[0][1][0], records()[2][1][:-2], rtol=1e-10)
-    for wrong, right in (("gain=0", "0.995"), ("gain=low", "0.995"), ("delay=late", "0.002")):
+    assert cli.main([*words, "gain_std=0.004"]) == 0
+    test = recorded_test.load("test.h5").measurement()
+    assert test.gain_std.tolist() == [0.004] and test.base_gain_std is None
+    wrongs = ("gain=0", "0.995"), ("gain=low", "0.995"), ("gain_std=-1", "0.005"), ("delay=late", "0.002")
+    for wrong, right in wrongs:
         capsys.readouterr()
         assert cli.main([*words, wrong]) == 2
         told = capsys.readouterr().err
         assert told.count("\n") == 1 and wrong[:4] in told and right in told
+
+
+def test_tolerances_of_base_and_force_are_those_of_their_directions(tmp_path):
+    """Of a rotation by two sensors at z = 1 and 3 m: (a_2 - a_1) / 2, of which each is -1/2 and 3/2 at unit rotation."""
+    x = np.random.default_rng(0).standard_normal((3, 400))
+    np.savez(tmp_path / "run.npz", fs=200.0, low=x[0], high=x[1], top=x[2])
+    place = lambda z: {"axis": "x", "position": [0.0, 0.0, z], "unit": "m/s²"}  # noqa: E731
+    said = {"base_axes": "x ry", "sensor": [
+        {"column": "low", "role": "base", "gain_std": 0.01, **place(1.0)},
+        {"column": "high", "role": "base", "gain_std": 0.01, **place(3.0)},
+        {"column": "top", "role": "response", "gain_std": 0.02, **place(5.0)},
+    ]}  # fmt: skip
+    test = sysid.read(tmp_path / "run.npz", said)
+    assert test.gain_std.tolist() == [0.02] and test.force_gain_std is None
+    # x is 3/2 a_1 - a_2 / 2.
+    np.testing.assert_allclose(test.base_gain_std, 0.01 * np.hypot([1.5, 0.5], [0.5, 1.5]))
 
 
 def test_a_stated_delay_is_taken_off_its_channel_in_records_and_spectra(tmp_path):
