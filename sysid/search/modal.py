@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_number
 from sysid.finding import Finding
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.modal_estimate import index_of, residual_of, theta_of
+from sysid.modal_analysis.modal_estimate import ModalEstimate, index_of, residual_of, theta_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
@@ -35,7 +35,7 @@ from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom
 from sysid.search.local import LocalResult, solve
 from sysid.search.modal_program import End, Spectrum, Ties, fit_apart, solve_modes
 from sysid.search.session import Session
-from sysid.search.stated_masses import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.stated_masses import modal_masses_of, stated_totals, to_stated_totals
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.superelement import ResidualModes
@@ -292,7 +292,7 @@ def modal_structure(
     chosen = degrees_of_freedom(problem, modes, options.sensors)
     remainder = end.rigid - modes.gamma.T @ modes.gamma
     if test.force is None:
-        t = _modal_masses(problem, modes, chosen)
+        t = modal_masses_of(problem, modes, chosen)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
         residual = residual.without_mass(problem.totals)  # nothing weighs them
@@ -392,19 +392,28 @@ def damping_bounds(problem: Prepared) -> tuple[float, float]:
 
 def _again(
     problem: Prepared, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
-    *, bounded: bool = True,
+    *, bounded: bool = True, far: float = 2.0,
 ) -> ModalFit:  # fmt: skip
-    """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""
+    """A fit from where another ended, with ties, and damping ratios within the problem's bounds.
+
+    The statistics of an estimate hold near it: where what they lead to misses `far` times as much of the records as it
+    does, as with mass that a light mode cannot have, the lines tell.
+    """
     modes = end.modes
     first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
     # Poles beyond the lines mean nothing by themselves, and several may be next to exchangeable.
     held = ~problem.of_structure(modes.omega[first])
-    found = solve_modes(
-        problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
+    solved = lambda modal: solve_modes(  # noqa: E731
+        modal, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
         unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
         max_iterations=max_iterations,
     )  # fmt: skip
+    modal = problem.modal[0]
+    found = solved(modal)
+    near = not modal.of_records or modal.coupling is not None or monitor.is_over
+    if not near and residual_of(modal, found.modes) > far * residual_of(modal, modal.modes) + EXACT:
+        found = solved(ModalEstimate.of_lines(modal.records))
     return replace(found, static=end.static)
 
 
@@ -426,17 +435,6 @@ def _free_spectrum(
         return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
 
     return spectrum
-
-
-def _modal_masses(problem: Prepared, modes: Modes, chosen: DegreesOfFreedom) -> Array:
-    """Modal masses that what is stated of the mass makes likely, (m,)."""
-    P, G, groups = chosen.coordinates(problem, modes.phi)
-    known, n = problem.known_mass, problem.geometry.n
-    if np.all(np.isfinite(known)) and len(P) == n:
-        return of_known_mass(known, P, modes.gamma, G)
-    # Known entries of a free mass are those of the sensors' own mass matrix.
-    ours = problem.formulation.mass.free and len(P) == n and chosen.modes.size == 0
-    return nearest_lumped(problem, P, modes.gamma, G, groups, known if ours else None)
 
 
 def held_by_model(problem: Prepared, structure: Structure) -> Array:

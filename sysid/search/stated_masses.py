@@ -6,8 +6,10 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.expressions import lower_entries
 from sysid.problem.prepared import Prepared
+from sysid.search.degrees_of_freedom import DegreesOfFreedom
 from sysid.search.modal_program import Ties
 from sysid.structure.structure import Array
 
@@ -136,3 +138,14 @@ def of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
     rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
     t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
     return np.maximum(t, np.finfo(float).eps * t.max())
+
+
+def modal_masses_of(problem: Prepared, modes: Modes, chosen: DegreesOfFreedom) -> Array:
+    """Modal masses that what is stated of the mass makes likely, (m,)."""
+    P, G, groups = chosen.coordinates(problem, modes.phi)
+    known, n = problem.known_mass, problem.geometry.n
+    if np.all(np.isfinite(known)) and len(P) == n:
+        return of_known_mass(known, P, modes.gamma, G)
+    # Known entries of a free mass are those of the sensors' own mass matrix.
+    ours = problem.formulation.mass.free and len(P) == n and chosen.modes.size == 0
+    return nearest_lumped(problem, P, modes.gamma, G, groups, known if ours else None)

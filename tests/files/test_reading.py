@@ -281,7 +281,7 @@ def test_gain_and_delay_are_stated_at_the_command_line_too(tmp_path, monkeypatch
 
 
 def test_tolerances_of_base_and_force_are_those_of_their_directions(tmp_path):
-    """Of a rotation by two sensors at z = 1 and 3 m: (a_2 - a_1) / 2, of which each is -1/2 and 3/2 at unit rotation."""
+    """Two sensors at z = 1 and 3 m: ry is (a_2 - a_1) / 2, of which these are -1/2 and 3/2 at unit rotation."""
     x = np.random.default_rng(0).standard_normal((3, 400))
     np.savez(tmp_path / "run.npz", fs=200.0, low=x[0], high=x[1], top=x[2])
     place = lambda z: {"axis": "x", "position": [0.0, 0.0, z], "unit": "m/s²"}  # noqa: E731

@@ -83,8 +83,8 @@ class GainErrors:
         weight = std**-2.0
         size = np.append(weight.sum(), weight.sum() - weight)  # of all, and without each
         without = np.append(one, (np.sum(weight * error) - weight * error) / size[1:])
-        shown = np.abs(without) > likely * np.hypot(size**-0.5, self.tolerance[known].min())
-        return one if alike and np.all(shown) else None
+        clear = np.abs(without) > likely * np.hypot(size**-0.5, self.tolerance[known].min())
+        return one if alike and np.all(clear) else None
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -96,7 +96,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     share it are counted as such; noise that is stated larger counts as stated. What was taken off the records within
     stated tolerances is a part of the errors.
     """
-    found, calibration = _shown(modal, structure), modal.calibration
+    found, calibration = _of_left(modal, structure), modal.calibration
     if calibration is None:
         return found
     H, taken = seen_at_sensors(modal.records), calibration.seen(modal.records)
@@ -104,7 +104,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     return replace(found, error=(1 + found.error) * (1 + taken) - 1, tolerance=tolerance)
 
 
-def _shown(modal: ModalEstimate, structure: Structure) -> GainErrors:
+def _of_left(modal: ModalEstimate, structure: Structure) -> GainErrors:
     """Those of what is left in the records."""
     test, gain = modal.records, modal.gain
     nothing = np.full(test.n_sensors, np.nan)
