@@ -99,7 +99,7 @@ def one_test(task: tuple[str, int]) -> Found:
         read = replace(read, gain_std=std, base_gain_std=std, force_gain_std=std)
     result = sysid.identify(sysid.Problem(read, mass=sysid.FullMass()), rng=0)
     said = next((f"{one.kind}: {one.sentence}" for one in result.findings if one.severity != "note"), "nothing")
-    name, known = f"{truth.name} (test {number})", result.gains.std
+    name, known = f"{truth.name} (test {number})", np.where(np.isnan(result.gains.std), np.inf, result.gains.std)
     if case == "within":
         least = bound(truth, given)
         mine = _mine(result, truth, least)

@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from benchmarks.band.simulated_tests import draw
-from benchmarks.band.structures import structure
+from benchmarks.band.structures import structure as continuous
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.stiffness_and_damping import ProportionalDamping
@@ -405,7 +405,7 @@ def test_an_estimate_that_did_not_settle_is_no_success(random_structure, settled
 
 
 def test_statistics_that_lead_far_off_the_records_give_way_to_the_lines():
-    """A light mode just above the lines whose mass the estimate leaves more than open, beside what the base may have."""
-    test = draw(structure(5), 2).measurement
+    """A light mode just above the lines has a mass that the estimate leaves more than open."""
+    test = draw(continuous(5), 2).measurement
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
     assert result.success and result.residual < 0.05
