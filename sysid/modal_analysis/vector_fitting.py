@@ -96,10 +96,10 @@ def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
     """
     with one_thread():  # the same bits whatever else the machine does
         records = Records(test)
-        return _find(records, _Progress(monitor, records))
+        return _find(records, _Progress(monitor, records), test.rigid_body)
 
 
-def _find(records: Records, progress: _Progress) -> Poles:
+def _find(records: Records, progress: _Progress, rigid_body: Array) -> Poles:
     wanted, most = _count(records, progress), _most_poles(records)
     # Where lines are few a spare pole or two must do.
     count = min(wanted, most) if most > wanted - _SPARE else wanted
@@ -113,7 +113,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
     lines = records.lines
     below = omega < lines[0]
-    if np.any(below) and np.any(below := below & _of_one_sensor(records, omega, ratios)):  # a sensor's wrong gain
+    if np.any(below) and np.any(below := below & _of_gains(records, omega, ratios, rigid_body)):
         omega, ratios = _settled(records, omega[~below], ratios[~below], progress)
     if not np.any((omega > (1 - BESIDE) * lines[0]) & (omega < (1 + BESIDE) * lines[-1])):
         raise InputError(
@@ -123,15 +123,35 @@ def _find(records: Records, progress: _Progress) -> Poles:
     return _in_order(records, omega, ratios)
 
 
-def _of_one_sensor(records: Records, omega: Array, ratios: Array) -> NDArray[np.bool_]:
-    """True for poles that one sensor alone shows beyond chance, (m,): far below the lines its gain does so, no mode."""
-    fit, n = records.fit(omega, ratios), records.n_sensors
+def _of_gains(records: Records, omega: Array, ratios: Array, rigid_body: Array) -> NDArray[np.bool_]:
+    """True for poles that wrong gains show far below the lines, no mode, (m,): what else they explain is chance.
+
+    That of one sensor, or those of the base, by which all sensors move as its rows of G (n_sensors, d) say.
+    """
+    fit, n = records.fit(omega, ratios), len(rigid_body)
     worth = np.sum(fit.whitened.reshape(omega.size, -1, n) ** 2, axis=1)
     others = np.sum(worth, axis=1) - np.max(worth, axis=1)
-    freedom = fit.residues[0].size * (n - 1) / n
-    chance = _noise(records, fit, omega.size) * beyond_chance(freedom, CANDIDATES)
+    noise = _noise(records, fit, omega.size)
+    of_one = others < noise * beyond_chance(fit.residues[0].size * (n - 1) / n, CANDIDATES)
+    by_base, spread = _of_base(records, rigid_body), fit.spread[:, : records.driven]
+    turn = np.linalg.cholesky(np.einsum("kir,kjr->kij", spread, spread))
+    whiten = lambda residues: np.linalg.solve(turn, residues).reshape(omega.size, -1)  # noqa: E731
+    along = np.linalg.qr(np.stack([whiten(one[None]) for one in by_base], axis=2))[0]  # (m, entries, d)
+    rows = whiten(fit.residues[:, : records.driven])
+    rest = np.sum(rows**2, axis=1) - np.sum(np.einsum("ked,ke->kd", along, rows) ** 2, axis=1)
+    of_base = (rest < noise * beyond_chance(rows.shape[1] - len(by_base), CANDIDATES)) & (n > 2)
     # What explains most of the records is a mode, and beside another that has no pole yet chance is taken for too much.
-    return np.asarray((others < chance) & (fit.gain < _OF_GAIN * records.size)) & (n > 1)
+    return np.asarray((of_one | of_base) & (fit.gain < _OF_GAIN * records.size)) & (n > 1)
+
+
+def _of_base(records: Records, rigid_body: Array) -> Array:
+    """Residues (d, inputs, channels) by which all sensors move as with each direction of the base."""
+    d = rigid_body.shape[1]
+    if records.unit:  # each pair of sensor and direction is a channel
+        each: Array = np.einsum("jk,cj->jkc", np.eye(d), rigid_body).reshape(d, 1, -1)
+        return each * records.channel
+    inputs = np.linalg.pinv(records.moving)[: records.driven, :d]
+    return np.asarray(np.einsum("ij,cj->jic", inputs, rigid_body) * records.channel)
 
 
 def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monitor | None = None) -> Poles:

@@ -357,6 +357,21 @@ def test_a_wrong_gain_of_one_sensor_makes_no_pole_below_the_lines(error):
     assert all(np.min(np.abs(f - one)) < 1e-3 * one for one in truth.natural_frequencies)
 
 
+@pytest.mark.parametrize("unit", [True, False])
+def test_a_wrong_gain_of_the_base_makes_no_pole_below_the_lines(unit):
+    """All sensors show it, each as it moves with the base."""
+    test, error = draw(continuous.structure(7)).measurement, 0.02
+    misread = replace(test, base=(1 + error) * test.base)
+    if unit:
+        base = test.base[:, :1]
+        misread = replace(
+            test, base=np.ones_like(test.base), response=test.response / base / (1 + error), force=None,
+            response_std=test.response_std / np.abs(base), force_std=None,
+        )  # fmt: skip
+        assert misread.has_unit_runs
+    assert np.all(find_poles(misread).omega > 2 * np.pi * test.freq[0])
+
+
 def test_modes_below_the_lines_have_their_pole_and_cost_none_at_their_other_end():
     """A plane frame whose lines begin above its first mode: its other modes are found, the last one weak."""
     truth = continuous.structure(1)
