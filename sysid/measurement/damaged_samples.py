@@ -72,7 +72,7 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     quanta = [_quantum(record) for record in records]
     for channel, quantum in enumerate(quanta):
         stretches = [np.zeros((0, 2), np.intp)]
-        for one in _flat(records, channel, quantum, is_base=channel < n_base):
+        for one in _flat(records, channel, quantum, n_base):
             found.append(one)
             stretches.append(one.stretches)
         held.append(np.concatenate(stretches))
@@ -83,13 +83,13 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
 
 
 def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamples]:
-    """Channels with the same samples as one before, that change `least` times at least.
+    """Sensors and force with the samples of one before, that change `least` times at least.
 
-    A base may move along two of its axes alike.
+    A base may move along two of its axes alike, and be the record of a sensor that it carries.
     """
     sizes = np.sum(np.abs(records), axis=1)
-    for channel in range(max(n_base, 1), len(records)):
-        for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
+    for channel in range(n_base + 1, len(records)):
+        for other in n_base + np.flatnonzero(sizes[n_base:channel] == sizes[channel]):
             one = records[channel]
             if np.array_equal(one, records[other]) and np.count_nonzero(np.diff(one)) >= least:
                 yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
@@ -101,11 +101,16 @@ def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamp
 _AROUND = 64  # samples on either side, of which what is usual about others is told
 
 
+def _is_large(record: Array) -> NDArray[np.bool_]:
+    """Which samples are above a tenth of the largest, or of the largest tenth: spikes may be larger than all else."""
+    size = np.abs(record)
+    return np.asarray(size >= min(0.1 * size.max(), np.quantile(size, 0.9)))
+
+
 def _quantum(record: Array) -> float:
     """Step of a record: the least difference of neighbours where it is large; equal ones are within round-off."""
-    size = np.abs(record)
-    steps = np.abs(np.diff(record))[size[1:] >= 0.1 * size.max()]
-    tolerance = ROUND_OFF * float(size.max())
+    steps = np.abs(np.diff(record))[_is_large(record)[1:]]
+    tolerance = ROUND_OFF * float(np.abs(record).max())
     steps = steps[steps > tolerance]
     return float(steps.min()) if steps.size else tolerance
 
@@ -116,35 +121,45 @@ def _runs(flags: NDArray[np.bool_]) -> Stretches:
     return np.column_stack([edges[::2], edges[1::2] - 1])
 
 
-def _flat(
-    records: Array, channel: int, quantum: float, *, is_base: bool, lively: float = 0.12
-) -> Iterator[DamagedSamples]:
-    """Flat tops, then gaps, then held values of a channel."""
+def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: float = 0.12) -> Iterator[DamagedSamples]:
+    """Flat tops, then gaps, then held values of a channel; none of one that a slow converter or recorder holds."""
     record = records[channel]
-    if quantum == 0.0:  # it is zero all along
-        return
     tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
+    at = _alike(record, tolerance)
+    if _is_slow(record, at, tolerance):
+        return
     ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
     logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
     if abs(record.max() + record.min()) < quantum:  # of one range
         logs = [sum(logs)] * 2
-    is_gap = [len(at) == 1 and abs(record[at[0, 0]]) <= tolerance for at in ends]
-    tops = [at for at, log, gap in zip(ends, logs, is_gap, strict=True) if log < chance and not gap]
+    rests = np.array([0.0, np.median(record)])  # of pulses to one side, and of a gap
+    is_rest = [np.any(np.abs(record[at[0, 0]] - rests) <= tolerance) for at in ends]
+    tops = [at for at, log, rest in zip(ends, logs, is_rest, strict=True) if log < chance and not rest]
     clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
     if len(clipped):
         yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
-    at = _runs(np.abs(np.diff(record)) <= tolerance)  # of differences: a stretch has one sample more
-    at[:, 1] += 1
-    at = at[at[:, 1] - at[:, 0] > 1]
-    if len(clipped):
-        at = at[~np.isin(at[:, 0], clipped[:, 0])]
+    at = at[(at[:, 1] - at[:, 0] > 1) & ~np.isin(at[:, 0], clipped[:, 0])]
     at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
-    at = at[np.array([_others_move(records, channel, stretch, is_base, lively) for stretch in at], dtype=bool)]
+    at = at[np.array([_others_move(records, channel, stretch, n_base, lively) for stretch in at], dtype=bool)]
     zero = np.abs(record[at[:, 0]]) <= tolerance
     if np.any(zero):
         yield _damage("dropout", channel, at[zero], 0.0)
     if not np.all(zero):
         yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
+
+
+def _alike(record: Array, tolerance: float) -> Stretches:
+    """First and last of each stretch of samples of one value, be it one sample, (k, 2)."""
+    ends = np.flatnonzero(np.abs(np.diff(record)) > tolerance)
+    return np.column_stack([np.append(0, ends + 1), np.append(ends, record.size - 1)])
+
+
+def _is_slow(record: Array, at: Stretches, tolerance: float) -> bool:
+    """True of a record that never moves, or of whose large values between its ends most are held."""
+    value = record[at[:, 0]]
+    between = (value < record.max() - tolerance) & (value > record.min() + tolerance)
+    length = (at[:, 1] - at[:, 0] + 1)[between & _is_large(record)[at[:, 0]]]
+    return len(at) == 1 or (length.size > 0 and bool(np.median(length) > 1))
 
 
 def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> DamagedSamples:
@@ -208,17 +223,19 @@ def _held(
     return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
 
 
-def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool, lively: float) -> bool:
-    """False of a rest: what stands still at an end of a record with most of the others, or a base that does."""
+def _others_move(records: Array, channel: int, stretch: Stretches, n_base: int, lively: float) -> bool:
+    """False of a rest: of a base, or of what stands still at an end of a record with most others or an axis of the base.
+
+    A base that stands still between bursts, while sensors ring, has no gap.
+    """
     first, last = stretch
-    n = records.shape[1]
-    if first > 0 and last < n - 1:
-        return True
-    if is_base:
+    if channel < n_base:
         return False
-    others = np.delete(records, channel, axis=0)
-    within = np.std(np.diff(others[:, first : last + 1]), axis=1)
-    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > lively)
+    if first > 0 and last < records.shape[1] - 1:
+        return True
+    within = np.std(np.diff(records[:, first : last + 1]), axis=1)
+    moves = within / np.maximum(np.std(np.diff(records), axis=1), np.finfo(float).tiny)
+    return bool(np.min([*moves[:n_base], np.median(np.delete(moves, channel))]) > lively)
 
 
 # Spikes: samples that those around them do not predict.
