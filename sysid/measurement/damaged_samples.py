@@ -52,13 +52,15 @@ class DamagedSamples:
         return int(np.sum(self.stretches[:, 1] - self.stretches[:, 0] + 1))
 
 
-def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
+def damaged_samples(records: Array, n_base: int = 0, rest: int = 16) -> list[DamagedSamples]:
     """Damage of the records of a run.
 
     Parameters
     ----------
     records : (channels, n)
-        The base first, `n_base` of them: a base may begin and end at rest while sensors move.
+        The base first, `n_base` of them: a base may rest while sensors move.
+    rest : int
+        Samples of one value after which a channel may start, and before which it may stop, as suddenly as in a spike.
 
     Returns
     -------
@@ -71,7 +73,8 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     held: list[Stretches] = []
     quanta = [_quantum(record) for record in records]
     for channel, quantum in enumerate(quanta):
-        stretches = [np.zeros((0, 2), np.intp)]
+        stretches = [_alike(records[channel])]
+        stretches[0] = stretches[0][stretches[0][:, 1] - stretches[0][:, 0] > rest]
         for one in _flat(records, channel, quantum, n_base):
             found.append(one)
             stretches.append(one.stretches)
@@ -101,6 +104,10 @@ def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamp
 _AROUND = 64  # samples on either side, of which what is usual about others is told
 
 
+def _round_off(record: Array) -> float:
+    return ROUND_OFF * float(np.abs(record).max())
+
+
 def _is_large(record: Array) -> NDArray[np.bool_]:
     """Which samples are above a tenth of the largest, or of the largest tenth: spikes may be larger than all else."""
     size = np.abs(record)
@@ -110,7 +117,7 @@ def _is_large(record: Array) -> NDArray[np.bool_]:
 def _quantum(record: Array) -> float:
     """Step of a record: the least difference of neighbours where it is large; equal ones are within round-off."""
     steps = np.abs(np.diff(record))[_is_large(record)[1:]]
-    tolerance = ROUND_OFF * float(np.abs(record).max())
+    tolerance = _round_off(record)
     steps = steps[steps > tolerance]
     return float(steps.min()) if steps.size else tolerance
 
@@ -124,9 +131,9 @@ def _runs(flags: NDArray[np.bool_]) -> Stretches:
 def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: float = 0.12) -> Iterator[DamagedSamples]:
     """Flat tops, then gaps, then held values of a channel; none of one that a slow converter or recorder holds."""
     record = records[channel]
-    tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
-    at = _alike(record, tolerance)
-    if _is_slow(record, at, tolerance):
+    tolerance, chance = _round_off(record), np.log(FALSE_ALARM / (2 * len(records)))
+    at = _alike(record)
+    if _is_slow(record, at):
         return
     ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
     logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
@@ -148,15 +155,15 @@ def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: flo
         yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
 
 
-def _alike(record: Array, tolerance: float) -> Stretches:
+def _alike(record: Array) -> Stretches:
     """First and last of each stretch of samples of one value, be it one sample, (k, 2)."""
-    ends = np.flatnonzero(np.abs(np.diff(record)) > tolerance)
+    ends = np.flatnonzero(np.abs(np.diff(record)) > _round_off(record))
     return np.column_stack([np.append(0, ends + 1), np.append(ends, record.size - 1)])
 
 
-def _is_slow(record: Array, at: Stretches, tolerance: float) -> bool:
+def _is_slow(record: Array, at: Stretches) -> bool:
     """True of a record that never moves, or of whose large values between its ends most are held."""
-    value = record[at[:, 0]]
+    value, tolerance = record[at[:, 0]], _round_off(record)
     between = (value < record.max() - tolerance) & (value > record.min() + tolerance)
     length = (at[:, 1] - at[:, 0] + 1)[between & _is_large(record)[at[:, 0]]]
     return len(at) == 1 or (length.size > 0 and bool(np.median(length) > 1))
@@ -246,10 +253,13 @@ class _Errors:
     """Estimates of errors of one sample, and of two that have the same, beside what they usually are.
 
     An error h of the samples of a spectrum D has the estimate ``sum(D* X / S) / sum(|D|² / S)`` in a record X of the
-    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, and `level` what is
-    beyond them and the size of the record there, (channels, 2, parts).
+    power spectrum S. Attributes: `single`, those of one sample, with signs, (channels, n); `filters`, 1 / S,
+    (channels, lines); `heights`, sizes of both, (channels, 2, n); `usual`, those of the `parts` beside each part, and
+    `level`, what is beyond them and the size of the record there, (channels, 2, parts).
     """
 
+    single: Array
+    filters: Array
     heights: Array
     usual: Array
     level: Array
@@ -259,39 +269,46 @@ class _Errors:
     def of(cls, records: Array, quanta: Array, out: float = 8.0) -> _Errors:
         n = records.shape[1]
         parts = np.append(np.arange(0, max(n - _AROUND, 0) + 1, _AROUND), n)
-        heights = np.array([_heights(record) for record in records])
-        usual = np.sqrt(np.pi / 2) * np.array([[_beside(its, parts) for its in both] for both in heights])
-        around = np.array([_beside(np.abs(record - record.mean()), parts) for record in records])
+        single, filters = _filtered(records)
+        heights = _heights(single, filters)
+        usual = np.sqrt(np.pi / 2) * _beside(heights, parts)
+        around = _beside(np.abs(records - records.mean(axis=1, keepdims=True)), parts)
         level = np.maximum(out * usual, np.maximum(around, out * quanta[:, None])[:, None])
-        return cls(heights, usual, level, parts)
+        return cls(single, filters, heights, np.maximum(usual, np.finfo(float).tiny), level, parts)
 
-    def candidates(self, channel: int, out: float = 8.0, apart: float = 1.5) -> Iterator[tuple[int, int, int]]:
-        """First and last sample, and the part, of all that stand out in a channel.
+    def highest(
+        self, channel: int, out: float = 8.0, apart: float = 1.5, most: int = 400
+    ) -> Iterator[tuple[int, int, float]]:
+        """First and last sample, and size, of all errors that stand out in a channel, the largest first.
 
-        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones.
+        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones. What
+        the filter makes of each beside it is taken off before the next.
         """
-        for more, height in enumerate(self.heights[channel]):
-            level = self.level[channel, more]
-            high = np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level)
-            if not high.size:
-                continue
-            times = height / np.repeat(np.maximum(self.usual[channel, more], np.finfo(float).tiny), np.diff(self.parts))
-            least = apart * np.max(times[times < out])
-            for part in high:
-                start, end = self.parts[part : part + 2]
-                for at in start + np.flatnonzero((height[start:end] > level[part]) & (times[start:end] > least)):
-                    yield int(at), int(at + more), int(part)
+        heights, level, usual = self.heights[channel], self.level[channel], self.usual[channel]
+        if not np.any(np.maximum.reduceat(heights, self.parts[:-1], axis=1) > level):
+            return
+        single, pulse = self.single[channel].copy(), scipy.fft.irfft(self.filters[channel], self.single.shape[1])
+        pulse /= pulse[0]
+        usual, level = (np.repeat(part, np.diff(self.parts), axis=1) for part in (usual, level))
+        times = heights / usual
+        least = [[apart * np.max(its[its < out])] for its in times]
+        level = np.maximum(level, least * usual)
+        for _ in range(most):
+            times = np.where(heights > level, heights / usual, 0.0)
+            more, at = divmod(int(np.argmax(times)), single.size)
+            if times[more, at] == 0.0:
+                return
+            yield at, at + more, float(heights[more, at])
+            error = (single[at] + more * single[at - single.size + 1]) / (1 + more * (1 + 2 * pulse[1]))
+            single -= error * (np.roll(pulse, at) + more * np.roll(pulse, at + 1))
+            heights = _heights(single[None], self.filters[[channel]])[0]
 
-    def is_spike(
-        self, channel: int, first: int, last: int, part: int, foot: int = 3, top: float = 0.75, hit: float = 5.0
-    ) -> bool:
-        """True of the highest there, of as many samples as stand out most, where no other channel stands out."""
-        reach = slice(max(first - foot, 0), first + foot + 1)
-        tops = self.heights[:, :, reach].max(axis=2)
-        times = tops / np.maximum(self.usual[:, :, part], np.finfo(float).tiny)
-        own, more = times[channel], last - first
-        highest = self.heights[channel, more, first] > top * tops[channel, more]
-        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > hit) == 1)
+    def is_alone(self, channel: int, first: int, foot: int = 3, hit: float = 5.0) -> bool:
+        """True where no other channel stands out: else the structure was hit."""
+        part = np.searchsorted(self.parts, first, side="right") - 1
+        tops = self.heights[:, :, max(first - foot, 0) : first + foot + 1].max(axis=2)
+        times = np.max(tops / self.usual[:, :, part], axis=1)
+        return not np.any(np.delete(times, channel) > hit)
 
 
 def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
@@ -303,41 +320,46 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
     for channel in range(len(records)):
-        flags = np.zeros(n, dtype=bool)
-        for first, last, part in errors.candidates(channel):
+        flags, sizes = np.zeros(n, dtype=bool), [0.0]
+        for first, last, size in errors.highest(channel):
             near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
-            if clear <= first < n - clear and not near and errors.is_spike(channel, first, last, part):
+            if clear <= first < n - clear and not near and errors.is_alone(channel, first):
                 flags[first : last + 1] = True
+                sizes.append(size)
         if np.any(flags):
-            size = errors.heights[channel].max(axis=0)
-            yield DamagedSamples("spikes", channel, _runs(flags), float(size[flags].max()))
+            yield DamagedSamples("spikes", channel, _runs(flags), max(sizes))
 
 
-def _heights(record: Array) -> tuple[Array, Array]:
-    """Estimates of the size of an error of each sample, and of each two that have the same, (n,)."""
-    n = record.size
-    ramp = record[0] + np.linspace(0, 1, n) * (record[-1] - record[0])
-    spectrum = scipy.fft.rfft(record - ramp)
-    power = np.abs(spectrum) ** 2
-    if not np.any(power > np.finfo(float).tiny):
-        return np.zeros(n), np.zeros(n)
-    width = max(power.size // 256, 4)
-    starts = np.arange(0, max(power.size - width, 1), width)
-    sizes = np.diff(np.append(starts, power.size))
-    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes)
-    single = scipy.fft.irfft(spectrum / smooth, n)
+def _filtered(records: Array) -> tuple[Array, Array]:
+    """Estimates of an error of each sample, (channels, n), and the filters that gave them, (channels, lines)."""
+    channels, n = records.shape
+    first, last = records[:, :1], records[:, -1:]
+    spectra = scipy.fft.rfft(records - first - np.linspace(0, 1, n) * (last - first))
+    power = np.abs(spectra) ** 2
+    mean = np.maximum(power.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    width = max(power.shape[1] // 256, 4)
+    starts = np.arange(0, max(power.shape[1] - width, 1), width)
+    sizes = np.diff(np.append(starts, power.shape[1]))
+    filters = np.repeat(1 / (np.add.reduceat(power, starts, axis=1) / (sizes * mean) + 1e-5), sizes, axis=1)
+    return scipy.fft.irfft(spectra * filters, n) / filters.mean(axis=1, keepdims=True), filters
+
+
+def _heights(single: Array, filters: Array) -> Array:
+    """Sizes of errors of each sample, and of each two that have the same, (channels, 2, n)."""
     # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
-    twice = (2 * np.cos(np.linspace(0, np.pi / 2, power.size))) ** 2 / smooth
-    return np.abs(single) / np.mean(1 / smooth), np.abs(single + np.roll(single, -1)) / np.mean(twice)
+    twice = (2 * np.cos(np.linspace(0, np.pi / 2, filters.shape[1]))) ** 2
+    share = filters @ twice / filters.sum(axis=1)
+    return np.abs(np.stack([single, (single + np.roll(single, -1, axis=1)) / share[:, None]], axis=1))
 
 
 def _beside(size: Array, parts: Stretches) -> Array:
-    """The larger of the means of sizes (n,) over the parts before and behind each part, whose edges are `parts`.
+    """The larger of the means of sizes (..., n) over the parts before and behind each part, whose edges are `parts`.
 
     Those at the ends have themselves beside them.
     """
-    mean = np.pad(np.add.reduceat(size, parts[:-1]) / np.diff(parts), 1, mode="edge")
-    return np.asarray(np.maximum(mean[:-2], mean[2:]))
+    mean = np.add.reduceat(size, parts[:-1], axis=-1) / np.diff(parts)
+    mean = np.concatenate([mean[..., :1], mean, mean[..., -1:]], axis=-1)
+    return np.asarray(np.maximum(mean[..., :-2], mean[..., 2:]))
 
 
 # Hum: a line of one channel that the other channels do not predict, steady along the record.

@@ -32,6 +32,12 @@ def shaken(base):
     return np.vstack([base, structure.simulate(base[None], RATE)])
 
 
+def slow(n=N):
+    """Motion of ten samples a period and more."""
+    low = scipy.signal.butter(4, [0.005, 0.2], "bandpass", output="sos")
+    return scipy.signal.sosfilt(low, np.random.default_rng(1).standard_normal(n))
+
+
 def told(records, n_base=1):
     return [(one.kind, one.channel) for one in damaged_samples(records, n_base)]
 
@@ -142,10 +148,32 @@ def test_spikes_are_told_one_by_one(width):
     assert one.value == pytest.approx(6 * moving()[1].std(), rel=0.1)
 
 
+@pytest.mark.parametrize("height", [5, 15, 40, 100])
+@pytest.mark.parametrize("bits", [16, 24])
+def test_beside_large_spikes_of_slow_motion_no_sound_sample_is_told(height, bits):
+    """The filter makes waves beside a spike, 20 times a sensor's usual errors; steps are those of the record."""
+    records = shaken(slow())
+    at = np.array([367, 2952, 4100, 4500, 5700])
+    records[2, at] += height * records[2].std() * np.array([1, -1, 1, 1, -1])
+    records = rounded(records + 1e-3 * np.random.default_rng(2).standard_normal(records.shape), bits)
+    (one,) = damaged_samples(records, 1)
+    assert (one.kind, one.channel) == ("spikes", 2)
+    np.testing.assert_array_equal(one.stretches, np.column_stack([at, at]))
+
+
 def test_a_structure_that_is_hit_has_no_spikes():
     records = moving()
     records[:, 3000] += 10 * records.std(axis=1)
     assert told(records) == []
+
+
+@pytest.mark.parametrize("width", [1, 2, 4, 8])
+@pytest.mark.parametrize("height", [5, 20, 60])
+def test_knocks_of_the_base_are_no_spikes(width, height):
+    base = slow()
+    for first in (700, 1900, 2800, 4100, 5300):
+        base[first : first + width] += height * base.std() * np.sin(np.pi * (np.arange(width) + 0.5) / width)
+    assert told(rounded(shaken(base), 24)) == []
 
 
 def test_hum_of_one_channel_is_told_with_its_frequency_and_a_tone_of_all_is_not():
