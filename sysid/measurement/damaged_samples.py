@@ -231,9 +231,9 @@ def _held(
 
 
 def _others_move(records: Array, channel: int, stretch: Stretches, n_base: int, lively: float) -> bool:
-    """False of a rest: of a base, or of what stands still at an end of a record with most others or an axis of the base.
+    """False of a rest: a base may stand still between bursts, while sensors ring.
 
-    A base that stands still between bursts, while sensors ring, has no gap.
+    So may any channel at an end of a record, with most of the others, or with an axis of the base.
     """
     first, last = stretch
     if channel < n_base:
@@ -332,7 +332,7 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
 
 def _filtered(records: Array) -> tuple[Array, Array]:
     """Estimates of an error of each sample, (channels, n), and the filters that gave them, (channels, lines)."""
-    channels, n = records.shape
+    n = records.shape[1]
     first, last = records[:, :1], records[:, -1:]
     spectra = scipy.fft.rfft(records - first - np.linspace(0, 1, n) * (last - first))
     power = np.abs(spectra) ** 2

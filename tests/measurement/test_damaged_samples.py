@@ -33,8 +33,8 @@ def shaken(base):
 
 
 def slow(n=N):
-    """Motion of ten samples a period and more."""
-    low = scipy.signal.butter(4, [0.005, 0.2], "bandpass", output="sos")
+    """Motion of forty samples a period and more."""
+    low = scipy.signal.butter(4, [0.005, 0.05], "bandpass", output="sos")
     return scipy.signal.sosfilt(low, np.random.default_rng(1).standard_normal(n))
 
 
@@ -151,7 +151,7 @@ def test_spikes_are_told_one_by_one(width):
 @pytest.mark.parametrize("height", [5, 15, 40, 100])
 @pytest.mark.parametrize("bits", [16, 24])
 def test_beside_large_spikes_of_slow_motion_no_sound_sample_is_told(height, bits):
-    """The filter makes waves beside a spike, 20 times a sensor's usual errors; steps are those of the record."""
+    """The filter of errors has waves beside each, which stand out too where the spike is large."""
     records = shaken(slow())
     at = np.array([367, 2952, 4100, 4500, 5700])
     records[2, at] += height * records[2].std() * np.array([1, -1, 1, 1, -1])
