@@ -111,7 +111,7 @@ def _round_off(record: Array) -> float:
 def _is_large(record: Array) -> NDArray[np.bool_]:
     """Which samples are above a tenth of the largest, or of the largest tenth: spikes may be larger than all else."""
     size = np.abs(record)
-    return np.asarray(size >= min(0.1 * size.max(), np.quantile(size, 0.9)))
+    return np.asarray(size >= min(0.1 * size.max(), np.quantile(size[:: size.size // 10_000 + 1], 0.9)))
 
 
 def _quantum(record: Array) -> float:
@@ -139,8 +139,8 @@ def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: flo
     logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
     if abs(record.max() + record.min()) < quantum:  # of one range
         logs = [sum(logs)] * 2
-    rests = np.array([0.0, np.median(record)])  # of pulses to one side, and of a gap
-    is_rest = [np.any(np.abs(record[at[0, 0]] - rests) <= tolerance) for at in ends]
+    # Pulses to one side begin and end at rest, be it zero or where most samples are; so does a gap.
+    is_rest = [abs(record[at[0, 0]]) <= tolerance or 2 * np.sum(at[:, 1] - at[:, 0] + 1) > record.size for at in ends]
     tops = [at for at, log, rest in zip(ends, logs, is_rest, strict=True) if log < chance and not rest]
     clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
     if len(clipped):
@@ -163,6 +163,8 @@ def _alike(record: Array) -> Stretches:
 
 def _is_slow(record: Array, at: Stretches) -> bool:
     """True of a record that never moves, or of whose large values between its ends most are held."""
+    if 2 * len(at) > record.size + 1:  # a value has less than two samples
+        return False
     value, tolerance = record[at[:, 0]], _round_off(record)
     between = (value < record.max() - tolerance) & (value > record.min() + tolerance)
     length = (at[:, 1] - at[:, 0] + 1)[between & _is_large(record)[at[:, 0]]]
@@ -334,22 +336,29 @@ def _filtered(records: Array) -> tuple[Array, Array]:
     """Estimates of an error of each sample, (channels, n), and the filters that gave them, (channels, lines)."""
     n = records.shape[1]
     first, last = records[:, :1], records[:, -1:]
-    spectra = scipy.fft.rfft(records - first - np.linspace(0, 1, n) * (last - first))
-    power = np.abs(spectra) ** 2
-    mean = np.maximum(power.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    moving = records - first - np.linspace(0, 1, n) * (last - first)
+    size = np.maximum(np.abs(moving).max(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    spectra = scipy.fft.rfft((moving / size).astype(np.float32))  # in half the time
+    power = spectra.real**2 + spectra.imag**2
+    mean = np.maximum(power.mean(axis=1, keepdims=True), np.finfo(np.float32).tiny)
     width = max(power.shape[1] // 256, 4)
     starts = np.arange(0, max(power.shape[1] - width, 1), width)
     sizes = np.diff(np.append(starts, power.shape[1]))
-    filters = np.repeat(1 / (np.add.reduceat(power, starts, axis=1) / (sizes * mean) + 1e-5), sizes, axis=1)
-    return scipy.fft.irfft(spectra * filters, n) / filters.mean(axis=1, keepdims=True), filters
+    inverse = 1 / (np.add.reduceat(power, starts, axis=1) / (sizes * mean) + 1e-5)
+    filters = np.repeat(inverse.astype(np.float32), sizes, axis=1)
+    spectra *= filters * (size / filters.mean(axis=1, keepdims=True)).astype(np.float32)
+    return scipy.fft.irfft(spectra, n, overwrite_x=True), filters
 
 
 def _heights(single: Array, filters: Array) -> Array:
     """Sizes of errors of each sample, and of each two that have the same, (channels, 2, n)."""
     # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
     twice = (2 * np.cos(np.linspace(0, np.pi / 2, filters.shape[1]))) ** 2
-    share = filters @ twice / filters.sum(axis=1)
-    return np.abs(np.stack([single, (single + np.roll(single, -1, axis=1)) / share[:, None]], axis=1))
+    share = filters @ twice.astype(np.float32) / filters.sum(axis=1)
+    heights = np.stack([single, np.roll(single, -1, axis=1)], axis=1)
+    heights[:, 1] += single
+    heights[:, 1] /= share[:, None]
+    return np.abs(heights, out=heights)
 
 
 def _beside(size: Array, parts: Stretches) -> Array:
