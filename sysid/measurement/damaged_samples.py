@@ -52,15 +52,13 @@ class DamagedSamples:
         return int(np.sum(self.stretches[:, 1] - self.stretches[:, 0] + 1))
 
 
-def damaged_samples(records: Array, n_base: int = 0, rest: int = 16) -> list[DamagedSamples]:
+def damaged_samples(records: Array, n_base: int = 1) -> list[DamagedSamples]:
     """Damage of the records of a run.
 
     Parameters
     ----------
     records : (channels, n)
         The base first, `n_base` of them: a base may rest while sensors move.
-    rest : int
-        Samples of one value after which a channel may start, and before which it may stop, as suddenly as in a spike.
 
     Returns
     -------
@@ -73,8 +71,7 @@ def damaged_samples(records: Array, n_base: int = 0, rest: int = 16) -> list[Dam
     held: list[Stretches] = []
     quanta = [_quantum(record) for record in records]
     for channel, quantum in enumerate(quanta):
-        stretches = [_alike(records[channel])]
-        stretches[0] = stretches[0][stretches[0][:, 1] - stretches[0][:, 0] > rest]
+        stretches = [np.zeros((0, 2), np.intp)]
         for one in _flat(records, channel, quantum, n_base):
             found.append(one)
             stretches.append(one.stretches)
@@ -147,7 +144,7 @@ def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: flo
         yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
     at = at[(at[:, 1] - at[:, 0] > 1) & ~np.isin(at[:, 0], clipped[:, 0])]
     at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
-    at = at[np.array([_others_move(records, channel, stretch, n_base, lively) for stretch in at], dtype=bool)]
+    at = at[_no_rest(records, channel, at, n_base, lively)]
     zero = np.abs(record[at[:, 0]]) <= tolerance
     if np.any(zero):
         yield _damage("dropout", channel, at[zero], 0.0)
@@ -232,19 +229,19 @@ def _held(
     return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
 
 
-def _others_move(records: Array, channel: int, stretch: Stretches, n_base: int, lively: float) -> bool:
-    """False of a rest: a base may stand still between bursts, while sensors ring.
+def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: float) -> NDArray[np.bool_]:
+    """Which stretches (k, 2) are no rest: a base may stand still between bursts, while sensors ring.
 
-    So may any channel at an end of a record, with most of the others, or with an axis of the base.
+    So may any channel with all of the base and, at an end of a record, with one axis of it or with most others.
     """
-    first, last = stretch
-    if channel < n_base:
-        return False
-    if first > 0 and last < records.shape[1] - 1:
-        return True
-    within = np.std(np.diff(records[:, first : last + 1]), axis=1)
-    moves = within / np.maximum(np.std(np.diff(records), axis=1), np.finfo(float).tiny)
-    return bool(np.min([*moves[:n_base], np.median(np.delete(moves, channel))]) > lively)
+    if channel < n_base or not len(at):
+        return np.zeros(len(at), dtype=bool)
+    away = (records - np.median(records, axis=1, keepdims=True)) ** 2
+    least = lively**2 * np.var(records, axis=1)
+    moves = np.array([(away[:, first : last + 1].mean(axis=1) > least) | (least == 0) for first, last in at])
+    at_end, base = np.any((at == 0) | (at == records.shape[1] - 1), axis=1), moves[:, :n_base]
+    others = np.mean(np.delete(moves, channel, axis=1), axis=1) >= 0.5
+    return np.where(at_end, np.all(base, axis=1) & others, np.any(base, axis=1))
 
 
 # Spikes: samples that those around them do not predict.
@@ -317,7 +314,8 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
     """Samples of one channel that stand out of what all others of it predict.
 
     They are held against what is usual beside them, and against the record there. Where other channels have such
-    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`.
+    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`,
+    nor where a channel starts or stops moving.
     """
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
@@ -325,7 +323,10 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
         flags, sizes = np.zeros(n, dtype=bool), [0.0]
         for first, last, size in errors.highest(channel):
             near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
-            if clear <= first < n - clear and not near and errors.is_alone(channel, first):
+            steps = np.abs(np.diff(records[channel, max(first - clear, 0) : last + clear]))
+            sides = [np.median(steps[: clear - 2]), np.median(steps[2 - clear :])]
+            starts = min(sides) < 0.1 * max(sides)
+            if clear <= first < n - clear and not near and not starts and errors.is_alone(channel, first):
                 flags[first : last + 1] = True
                 sizes.append(size)
         if np.any(flags):
