@@ -16,7 +16,7 @@ Kind = Literal[
     "conjugated spectra", "late sensor", "relative responses", "positions", "unit", "sign", "swapped sensors", "gain",
     "table rocks", "force sign", "force unit", "frequencies in rad/s", "short segments",
     # Damaged samples that are left in the records, or were left out.
-    "clipped", "dropout", "held value", "spikes", "tone",
+    "clipped", "dropout", "held value", "spikes", "tone", "equal channels",
     # What speaks against a fit.
     "stopped", "bounds", "changing", "stated mass", "known entries", "lumped total", "constraint", "goal", "residual",
     "beyond noise", "unpredicted", "changes not judged", "stated masses", "stated values", "stated value", "in motion",

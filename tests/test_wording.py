@@ -663,8 +663,8 @@ DAMAGED = [
     ),
     (
         ("equal channels", 1, 6000, 1.0), False,
-        "sensor 2 holds the same samples as sensor 1: one record stands in two places; read the right one, or leave "
-        "this channel out",
+        "sensor 2 holds the same samples as sensor 1: one record stands in two places; it may be so by symmetry; "
+        "else read the right one, or leave this channel out",
     ),
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Damaged samples of a test: runs are cut where they last a short time, long ones are refused, all are told."""
+"""Damaged samples of a test: runs are cut where they last a short time, long clipping is refused, all are told."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MADE_BY = {
 }
 _REMEDIES = {
     "tone": "it stays in the records: find its source, such as the mains or a fan, or leave this channel out",
-    "equal channels": "read the right one, or leave this channel out",
+    "equal channels": "it may be so by symmetry; else read the right one, or leave this channel out",
 }
 
 
@@ -65,12 +65,13 @@ class DamagedChannel:
         """True of damage in some places, between which a run may be cut."""
         return self.kind not in ("tone", "equal channels")
 
-    def is_long(self, share: float = 0.01) -> bool:
-        """True of damage with which nothing is identified where it is not left out: this share of a channel's samples.
+    def is_refused(self, share: float = 0.01) -> bool:
+        """True of clipping that is not left out, of more than this share of a channel's samples.
 
-        Flat tops of so many samples, at 2.6 deviations of a Gaussian record, take 4 % of its rms.
+        Flat tops of so many samples, at 2.6 deviations of a Gaussian record, take 4 % of its rms. All else may be
+        sound: channels are equal by symmetry, and stand still where nothing moves them.
         """
-        return self.kind == "equal channels" or (self.is_local and self.count > share * self.samples)
+        return self.kind == "clipped" and not self.left_out and self.count > share * self.samples
 
     @property
     def sentence(self) -> str:
@@ -142,7 +143,7 @@ class SoundRuns:
         })  # fmt: skip
 
 
-def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cut: bool) -> SoundRuns:
+def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], delays: Array, *, cut: bool) -> SoundRuns:
     """Look for damage in the runs of a test.
 
     Parameters
@@ -152,13 +153,15 @@ def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cu
         Hz.
     names : sequence of str
         Of base, sensors and force, in this order.
+    delays : (k,)
+        s, by which channels are shifted afterwards.
     cut : bool
         Whether a run may be cut where samples are damaged.
 
     Raises
     ------
     InputError
-        Two channels are equal; damage of more than a hundredth of a channel's samples cannot be left out.
+        More than a hundredth of a channel's samples are clipped, and cannot be left out.
     """
     taken: list[TimeRun] = []
     source: list[int] = []
@@ -166,7 +169,7 @@ def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cu
     damage = damage_of_runs(runs, rate, names)
     for index, run in enumerate(runs):
         its = [one for one in damage if one.run == index + 1]
-        pieces = _pieces(its, rate, run.base.shape[1]) if cut else []
+        pieces = _pieces(its, rate, run.base.shape[1], delays) if cut else []
         cuts.append(bool(pieces))
         parts = [
             TimeRun(run.base[:, a:b], run.response[:, a:b], None if run.force is None else run.force[:, a:b])
@@ -175,7 +178,7 @@ def sound_runs(runs: Sequence[TimeRun], rate: float, names: Sequence[str], *, cu
         taken += parts or [run]
         source += [index] * max(len(parts), 1)
     told = tuple(replace(one, left_out=one.is_local and cuts[one.run - 1]) for one in damage)
-    refused = [one for one in told if one.is_long() and not one.left_out]
+    refused = [one for one in told if one.is_refused()]
     if refused:
         raise InputError(
             "; ".join(f"{one.sentence}{of_run(one.run - 1, len(runs))}; {one.remedy}" for one in refused[:3])
@@ -200,11 +203,12 @@ def _told(one: DamagedSamples, names: Sequence[str], run: TimeRun, number: int, 
 
 
 def _pieces(
-    damage: Sequence[DamagedChannel], rate: float, samples: int, piece: float = 0.1, kept: float = 0.75
+    damage: Sequence[DamagedChannel], rate: float, samples: int, delays: Array, piece: float = 0.1, kept: float = 0.75
 ) -> list[tuple[int, int]]:
     """First sample, and that after the last, of pieces between what is damaged; none where too little would be left.
 
-    A `piece` has such a share of the run at least, and all together what is `kept`.
+    A `piece` has such a share of the run at least, and four times the samples that it loses where channels are shifted
+    by their delays; all together have what is `kept`.
     """
     stretches = [np.round(one.stretches * rate).astype(int) for one in damage if one.is_local]
     if not stretches:
@@ -214,7 +218,8 @@ def _pieces(
     np.add.at(bad, at[:, 0], 1)
     np.add.at(bad, at[:, 1] + 1, -1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], np.cumsum(bad)[:-1] == 0, [False]]))).reshape(-1, 2)
-    long = edges[edges[:, 1] - edges[:, 0] >= piece * samples]
+    lost = 64 * bool(np.any(delays)) + np.ptp(np.append(delays, 0.0)) * rate  # to interpolate, and to shift
+    long = edges[edges[:, 1] - edges[:, 0] >= max(piece * samples, 4 * lost)]
     enough = np.sum(long[:, 1] - long[:, 0]) >= kept * samples
     return [(int(a), int(b)) for a, b in long] if enough else []
 

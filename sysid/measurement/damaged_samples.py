@@ -52,13 +52,13 @@ class DamagedSamples:
         return int(np.sum(self.stretches[:, 1] - self.stretches[:, 0] + 1))
 
 
-def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
+def damaged_samples(records: Array, n_base: int = 1) -> list[DamagedSamples]:
     """Damage of the records of a run.
 
     Parameters
     ----------
     records : (channels, n)
-        The base first, `n_base` of them: a base may begin and end at rest while sensors move.
+        The base first, `n_base` of them: a base may rest while sensors move.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
     quanta = [_quantum(record) for record in records]
     for channel, quantum in enumerate(quanta):
         stretches = [np.zeros((0, 2), np.intp)]
-        for one in _flat(records, channel, quantum, is_base=channel < n_base):
+        for one in _flat(records, channel, quantum, n_base):
             found.append(one)
             stretches.append(one.stretches)
         held.append(np.concatenate(stretches))
@@ -83,13 +83,13 @@ def damaged_samples(records: Array, n_base: int = 0) -> list[DamagedSamples]:
 
 
 def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamples]:
-    """Channels with the same samples as one before, that change `least` times at least.
+    """Sensors and force with the samples of one before, that change `least` times at least.
 
-    A base may move along two of its axes alike.
+    A base may move along two of its axes alike, and be the record of a sensor that it carries.
     """
     sizes = np.sum(np.abs(records), axis=1)
-    for channel in range(max(n_base, 1), len(records)):
-        for other in np.flatnonzero(sizes[:channel] == sizes[channel]):
+    for channel in range(n_base + 1, len(records)):
+        for other in n_base + np.flatnonzero(sizes[n_base:channel] == sizes[channel]):
             one = records[channel]
             if np.array_equal(one, records[other]) and np.count_nonzero(np.diff(one)) >= least:
                 yield DamagedSamples("equal channels", channel, np.array([[0, one.size - 1]]), float(other))
@@ -101,11 +101,20 @@ def _equal(records: Array, n_base: int, least: int = 50) -> Iterator[DamagedSamp
 _AROUND = 64  # samples on either side, of which what is usual about others is told
 
 
+def _round_off(record: Array) -> float:
+    return ROUND_OFF * float(np.abs(record).max())
+
+
+def _is_large(record: Array) -> NDArray[np.bool_]:
+    """Which samples are above a tenth of the largest, or of the largest tenth: spikes may be larger than all else."""
+    size = np.abs(record)
+    return np.asarray(size >= min(0.1 * size.max(), np.quantile(size[:: size.size // 10_000 + 1], 0.9)))
+
+
 def _quantum(record: Array) -> float:
     """Step of a record: the least difference of neighbours where it is large; equal ones are within round-off."""
-    size = np.abs(record)
-    steps = np.abs(np.diff(record))[size[1:] >= 0.1 * size.max()]
-    tolerance = ROUND_OFF * float(size.max())
+    steps = np.abs(np.diff(record))[_is_large(record)[1:]]
+    tolerance = _round_off(record)
     steps = steps[steps > tolerance]
     return float(steps.min()) if steps.size else tolerance
 
@@ -116,35 +125,47 @@ def _runs(flags: NDArray[np.bool_]) -> Stretches:
     return np.column_stack([edges[::2], edges[1::2] - 1])
 
 
-def _flat(
-    records: Array, channel: int, quantum: float, *, is_base: bool, lively: float = 0.12
-) -> Iterator[DamagedSamples]:
-    """Flat tops, then gaps, then held values of a channel."""
+def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: float = 0.12) -> Iterator[DamagedSamples]:
+    """Flat tops, then gaps, then held values of a channel; none of one that a slow converter or recorder holds."""
     record = records[channel]
-    if quantum == 0.0:  # it is zero all along
+    tolerance, chance = _round_off(record), np.log(FALSE_ALARM / (2 * len(records)))
+    at = _alike(record)
+    if _is_slow(record, at):
         return
-    tolerance, chance = ROUND_OFF * float(np.abs(record).max()), np.log(FALSE_ALARM / (2 * len(records)))
     ends = [_runs(sign * record >= np.max(sign * record) - tolerance) for sign in (1, -1)]
     logs = [_log_chance_of_tops(sign * record, at, quantum) for sign, at in zip((1, -1), ends, strict=True)]
     if abs(record.max() + record.min()) < quantum:  # of one range
         logs = [sum(logs)] * 2
-    is_gap = [len(at) == 1 and abs(record[at[0, 0]]) <= tolerance for at in ends]
-    tops = [at for at, log, gap in zip(ends, logs, is_gap, strict=True) if log < chance and not gap]
+    # Pulses to one side begin and end at rest, be it zero or where most samples are; so does a gap.
+    is_rest = [abs(record[at[0, 0]]) <= tolerance or 2 * np.sum(at[:, 1] - at[:, 0] + 1) > record.size for at in ends]
+    tops = [at for at, log, rest in zip(ends, logs, is_rest, strict=True) if log < chance and not rest]
     clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
     if len(clipped):
         yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
-    at = _runs(np.abs(np.diff(record)) <= tolerance)  # of differences: a stretch has one sample more
-    at[:, 1] += 1
-    at = at[at[:, 1] - at[:, 0] > 1]
-    if len(clipped):
-        at = at[~np.isin(at[:, 0], clipped[:, 0])]
+    at = at[(at[:, 1] - at[:, 0] > 1) & ~np.isin(at[:, 0], clipped[:, 0])]
     at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
-    at = at[np.array([_others_move(records, channel, stretch, is_base, lively) for stretch in at], dtype=bool)]
+    at = at[_no_rest(records, channel, at, n_base, lively)]
     zero = np.abs(record[at[:, 0]]) <= tolerance
     if np.any(zero):
         yield _damage("dropout", channel, at[zero], 0.0)
     if not np.all(zero):
         yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
+
+
+def _alike(record: Array) -> Stretches:
+    """First and last of each stretch of samples of one value, be it one sample, (k, 2)."""
+    ends = np.flatnonzero(np.abs(np.diff(record)) > _round_off(record))
+    return np.column_stack([np.append(0, ends + 1), np.append(ends, record.size - 1)])
+
+
+def _is_slow(record: Array, at: Stretches) -> bool:
+    """True of a record that never moves, or of whose large values between its ends most are held."""
+    if 2 * len(at) > record.size + 1:  # a value has less than two samples
+        return False
+    value, tolerance = record[at[:, 0]], _round_off(record)
+    between = (value < record.max() - tolerance) & (value > record.min() + tolerance)
+    length = (at[:, 1] - at[:, 0] + 1)[between & _is_large(record)[at[:, 0]]]
+    return len(at) == 1 or (length.size > 0 and bool(np.median(length) > 1))
 
 
 def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> DamagedSamples:
@@ -208,17 +229,19 @@ def _held(
     return np.asarray(moves & ((last - first) * np.log(quantum / size) < np.log(chance)))
 
 
-def _others_move(records: Array, channel: int, stretch: Stretches, is_base: bool, lively: float) -> bool:
-    """False of a rest: what stands still at an end of a record with most of the others, or a base that does."""
-    first, last = stretch
-    n = records.shape[1]
-    if first > 0 and last < n - 1:
-        return True
-    if is_base:
-        return False
-    others = np.delete(records, channel, axis=0)
-    within = np.std(np.diff(others[:, first : last + 1]), axis=1)
-    return bool(np.median(within / np.maximum(np.std(np.diff(others), axis=1), np.finfo(float).tiny)) > lively)
+def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: float) -> NDArray[np.bool_]:
+    """Which stretches (k, 2) are no rest: a base may stand still between bursts, while sensors ring.
+
+    So may any channel with all of the base and, at an end of a record, with one axis of it or with most others.
+    """
+    if channel < n_base or not len(at):
+        return np.zeros(len(at), dtype=bool)
+    away = (records - np.median(records, axis=1, keepdims=True)) ** 2
+    least = lively**2 * np.var(records, axis=1)
+    moves = np.array([(away[:, first : last + 1].mean(axis=1) > least) | (least == 0) for first, last in at])
+    at_end, base = np.any((at == 0) | (at == records.shape[1] - 1), axis=1), moves[:, :n_base]
+    others = np.mean(np.delete(moves, channel, axis=1), axis=1) >= 0.5
+    return np.where(at_end, np.all(base, axis=1) & others, np.any(base, axis=1))
 
 
 # Spikes: samples that those around them do not predict.
@@ -229,10 +252,13 @@ class _Errors:
     """Estimates of errors of one sample, and of two that have the same, beside what they usually are.
 
     An error h of the samples of a spectrum D has the estimate ``sum(D* X / S) / sum(|D|² / S)`` in a record X of the
-    power spectrum S. `heights` are (channels, 2, n); `usual` those of the `parts` beside each part, and `level` what is
-    beyond them and the size of the record there, (channels, 2, parts).
+    power spectrum S. Attributes: `single`, those of one sample, with signs, (channels, n); `filters`, 1 / S,
+    (channels, lines); `heights`, sizes of both, (channels, 2, n); `usual`, those of the `parts` beside each part, and
+    `level`, what is beyond them and the size of the record there, (channels, 2, parts).
     """
 
+    single: Array
+    filters: Array
     heights: Array
     usual: Array
     level: Array
@@ -242,85 +268,108 @@ class _Errors:
     def of(cls, records: Array, quanta: Array, out: float = 8.0) -> _Errors:
         n = records.shape[1]
         parts = np.append(np.arange(0, max(n - _AROUND, 0) + 1, _AROUND), n)
-        heights = np.array([_heights(record) for record in records])
-        usual = np.sqrt(np.pi / 2) * np.array([[_beside(its, parts) for its in both] for both in heights])
-        around = np.array([_beside(np.abs(record - record.mean()), parts) for record in records])
+        single, filters = _filtered(records)
+        heights = _heights(single, filters)
+        usual = np.sqrt(np.pi / 2) * _beside(heights, parts)
+        around = _beside(np.abs(records - records.mean(axis=1, keepdims=True)), parts)
         level = np.maximum(out * usual, np.maximum(around, out * quanta[:, None])[:, None])
-        return cls(heights, usual, level, parts)
+        return cls(single, filters, heights, np.maximum(usual, np.finfo(float).tiny), level, parts)
 
-    def candidates(self, channel: int, out: float = 8.0, apart: float = 1.5) -> Iterator[tuple[int, int, int]]:
-        """First and last sample, and the part, of all that stand out in a channel.
+    def highest(
+        self, channel: int, out: float = 8.0, apart: float = 1.5, most: int = 400
+    ) -> Iterator[tuple[int, int, float]]:
+        """First and last sample, and size, of all errors that stand out in a channel, the largest first.
 
-        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones.
+        They are so much larger than all that is not `out`: motion in jerks has large errors and less large ones. What
+        the filter makes of each beside it is taken off before the next.
         """
-        for more, height in enumerate(self.heights[channel]):
-            level = self.level[channel, more]
-            high = np.flatnonzero(np.maximum.reduceat(height, self.parts[:-1]) > level)
-            if not high.size:
-                continue
-            times = height / np.repeat(np.maximum(self.usual[channel, more], np.finfo(float).tiny), np.diff(self.parts))
-            least = apart * np.max(times[times < out])
-            for part in high:
-                start, end = self.parts[part : part + 2]
-                for at in start + np.flatnonzero((height[start:end] > level[part]) & (times[start:end] > least)):
-                    yield int(at), int(at + more), int(part)
+        heights, level, usual = self.heights[channel], self.level[channel], self.usual[channel]
+        if not np.any(np.maximum.reduceat(heights, self.parts[:-1], axis=1) > level):
+            return
+        single, pulse = self.single[channel].copy(), scipy.fft.irfft(self.filters[channel], self.single.shape[1])
+        pulse /= pulse[0]
+        usual, level = (np.repeat(part, np.diff(self.parts), axis=1) for part in (usual, level))
+        times = heights / usual
+        least = [[apart * np.max(its[its < out])] for its in times]
+        level = np.maximum(level, least * usual)
+        for _ in range(most):
+            times = np.where(heights > level, heights / usual, 0.0)
+            more, at = divmod(int(np.argmax(times)), single.size)
+            if times[more, at] == 0.0:
+                return
+            yield at, at + more, float(heights[more, at])
+            error = (single[at] + more * single[at - single.size + 1]) / (1 + more * (1 + 2 * pulse[1]))
+            single -= error * (np.roll(pulse, at) + more * np.roll(pulse, at + 1))
+            heights = _heights(single[None], self.filters[[channel]])[0]
 
-    def is_spike(
-        self, channel: int, first: int, last: int, part: int, foot: int = 3, top: float = 0.75, hit: float = 5.0
-    ) -> bool:
-        """True of the highest there, of as many samples as stand out most, where no other channel stands out."""
-        reach = slice(max(first - foot, 0), first + foot + 1)
-        tops = self.heights[:, :, reach].max(axis=2)
-        times = tops / np.maximum(self.usual[:, :, part], np.finfo(float).tiny)
-        own, more = times[channel], last - first
-        highest = self.heights[channel, more, first] > top * tops[channel, more]
-        return bool(highest and own[more] == own.max() and np.count_nonzero(times[:, more] > hit) == 1)
+    def is_alone(self, channel: int, first: int, foot: int = 3, hit: float = 5.0) -> bool:
+        """True where no other channel stands out: else the structure was hit."""
+        part = np.searchsorted(self.parts, first, side="right") - 1
+        tops = self.heights[:, :, max(first - foot, 0) : first + foot + 1].max(axis=2)
+        times = np.max(tops / self.usual[:, :, part], axis=1)
+        return not np.any(np.delete(times, channel) > hit)
 
 
 def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
     """Samples of one channel that stand out of what all others of it predict.
 
     They are held against what is usual beside them, and against the record there. Where other channels have such
-    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`.
+    samples at once, the structure was hit. Nothing is judged within `clear` samples of the ends and of what is `held`,
+    nor where a channel starts or stops moving.
     """
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
     for channel in range(len(records)):
-        flags = np.zeros(n, dtype=bool)
-        for first, last, part in errors.candidates(channel):
+        flags, sizes = np.zeros(n, dtype=bool), [0.0]
+        for first, last, size in errors.highest(channel):
             near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
-            if clear <= first < n - clear and not near and errors.is_spike(channel, first, last, part):
+            steps = np.abs(np.diff(records[channel, max(first - clear, 0) : last + clear]))
+            sides = [np.median(steps[: clear - 2]), np.median(steps[2 - clear :])]
+            starts = min(sides) < 0.1 * max(sides)
+            if clear <= first < n - clear and not near and not starts and errors.is_alone(channel, first):
                 flags[first : last + 1] = True
+                sizes.append(size)
         if np.any(flags):
-            size = errors.heights[channel].max(axis=0)
-            yield DamagedSamples("spikes", channel, _runs(flags), float(size[flags].max()))
+            yield DamagedSamples("spikes", channel, _runs(flags), max(sizes))
 
 
-def _heights(record: Array) -> tuple[Array, Array]:
-    """Estimates of the size of an error of each sample, and of each two that have the same, (n,)."""
-    n = record.size
-    ramp = record[0] + np.linspace(0, 1, n) * (record[-1] - record[0])
-    spectrum = scipy.fft.rfft(record - ramp)
-    power = np.abs(spectrum) ** 2
-    if not np.any(power > np.finfo(float).tiny):
-        return np.zeros(n), np.zeros(n)
-    width = max(power.size // 256, 4)
-    starts = np.arange(0, max(power.size - width, 1), width)
-    sizes = np.diff(np.append(starts, power.size))
-    smooth = np.repeat(np.add.reduceat(power, starts) / sizes + 1e-5 * power.mean(), sizes)
-    single = scipy.fft.irfft(spectrum / smooth, n)
+def _filtered(records: Array) -> tuple[Array, Array]:
+    """Estimates of an error of each sample, (channels, n), and the filters that gave them, (channels, lines)."""
+    n = records.shape[1]
+    first, last = records[:, :1], records[:, -1:]
+    moving = records - first - np.linspace(0, 1, n) * (last - first)
+    size = np.maximum(np.abs(moving).max(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    spectra = scipy.fft.rfft((moving / size).astype(np.float32))  # in half the time
+    power = spectra.real**2 + spectra.imag**2
+    mean = np.maximum(power.mean(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    width = max(power.shape[1] // 256, 4)
+    starts = np.arange(0, max(power.shape[1] - width, 1), width)
+    sizes = np.diff(np.append(starts, power.shape[1]))
+    inverse = 1 / (np.add.reduceat(power, starts, axis=1) / (sizes * mean) + 1e-5)
+    filters = np.repeat(inverse.astype(np.float32), sizes, axis=1)
+    spectra *= filters * (size / filters.mean(axis=1, keepdims=True)).astype(np.float32)
+    return scipy.fft.irfft(spectra, n, overwrite_x=True), filters
+
+
+def _heights(single: Array, filters: Array) -> Array:
+    """Sizes of errors of each sample, and of each two that have the same, (channels, 2, n)."""
     # The spectrum of two samples that are alike is 2 cos(w / 2) times that of one.
-    twice = (2 * np.cos(np.linspace(0, np.pi / 2, power.size))) ** 2 / smooth
-    return np.abs(single) / np.mean(1 / smooth), np.abs(single + np.roll(single, -1)) / np.mean(twice)
+    twice = (2 * np.cos(np.linspace(0, np.pi / 2, filters.shape[1]))) ** 2
+    share = filters @ twice.astype(np.float32) / filters.sum(axis=1)
+    heights = np.stack([single, np.roll(single, -1, axis=1)], axis=1)
+    heights[:, 1] += single
+    heights[:, 1] /= share[:, None]
+    return np.abs(heights, out=heights)
 
 
 def _beside(size: Array, parts: Stretches) -> Array:
-    """The larger of the means of sizes (n,) over the parts before and behind each part, whose edges are `parts`.
+    """The larger of the means of sizes (..., n) over the parts before and behind each part, whose edges are `parts`.
 
     Those at the ends have themselves beside them.
     """
-    mean = np.pad(np.add.reduceat(size, parts[:-1]) / np.diff(parts), 1, mode="edge")
-    return np.asarray(np.maximum(mean[:-2], mean[2:]))
+    mean = np.add.reduceat(size, parts[:-1], axis=-1) / np.diff(parts)
+    mean = np.concatenate([mean[..., :1], mean, mean[..., -1:]], axis=-1)
+    return np.asarray(np.maximum(mean[..., :-2], mean[..., 2:]))
 
 
 # Hum: a line of one channel that the other channels do not predict, steady along the record.

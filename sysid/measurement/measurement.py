@@ -426,13 +426,11 @@ class Measurement:
         G = motion_of_sensors(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         described = checked_sensors(sensors)
-        sound = sound_runs(
-            records, float(sample_rate), names_of_channels(described, G, base_axes), cut=estimator == "records"
-        )
         others = as_float("base_delay", base_delay), as_float("force_delay", force_delay)
-        records = spectra.runs_on_one_clock(
-            sound.runs, np.append(stated_delays(described, len(G)), others), float(sample_rate)
-        )
+        delays = np.append(stated_delays(described, len(G)), others)
+        names, cut = names_of_channels(described, G, base_axes), estimator == "records"
+        sound = sound_runs(records, float(sample_rate), names, delays, cut=cut)
+        records = spectra.runs_on_one_clock(sound.runs, delays, float(sample_rate))
         given: Any = {"rigid_body": G, "sensors": without_delay(described), "base_axes": base_axes}
         if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)

@@ -8,7 +8,7 @@ from sysid.files.recorded_test import RecordedTest
 from sysid.finding import Severity
 
 RATE, N = 50.0, 6000
-KINDS = ("clipped", "dropout", "held value", "spikes", "tone")
+KINDS = ("clipped", "dropout", "held value", "spikes", "tone", "equal channels")
 TRUTH = sysid.Structure(
     np.diag([3.0, 2.0, 0.0]), [[8e3, -3e3, -5e3], [-3e3, 3e3, 0], [-5e3, 0, 5e3]], [0.02, 0.02], n_base=1
 )
@@ -48,6 +48,13 @@ def test_hum_stays_in_the_records_and_is_a_caution():
     assert (found.kind, found.severity, found.channel) == ("tone", Severity.CAUTION, "sensor 1")
     assert found.numbers["value"] == pytest.approx(6.3, abs=0.1 * RATE / N)
     assert result.judgement != "determined"
+
+
+def test_equal_channels_are_a_caution():
+    every = records()
+    every[2] = every[1]
+    _, (found,) = identified(every)
+    assert (found.kind, found.severity, found.channel) == ("equal channels", Severity.CAUTION, "sensor 2")
 
 
 def test_nothing_is_told_of_sound_records():

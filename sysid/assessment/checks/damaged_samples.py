@@ -12,7 +12,7 @@ from sysid.measurement.measurement import Measurement
 
 
 def damaged_channels(context: Context) -> Iterator[Finding]:
-    """Samples are clipped, missing, held or spikes, or a channel hums: they are left out, or to be mended."""
+    """Samples are clipped, missing, held or spikes, a channel hums, or two are equal: left out, or to be mended."""
     problem = context.problem
     yield from of_tests([list(_of_test(one.given)) for one in problem.modal[problem.first_test - 1 :]])
 
