@@ -46,8 +46,8 @@ CEILINGS = {
     # their own that files are brought from to one (190), axes and signs of exported rows (92), complex
     # expressions and residuals of the user's own (210),
     # damaged samples of records, found, left out or refused, and told (694),
-    # and tolerances of gains of all channels, their moves of the modes, and tables that rock (560),
-    "lines": 45_520,
+    # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
+    "lines": 45_640,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }
