@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def lines(reduced: bool) -> Iterator[Line]:
 def one_test(task: tuple[str, int, tuple[int, ...]]) -> Found:
     """One test of a case, of structures of these numbers in turn."""
     case, number, numbers = task
-    every = [one for one in map(structure, numbers) if one.count <= MODES and len(one.modes.shapes) >= one.count]
+    every = _of(numbers)
     truth = every[number % len(every)]
     given = draw(truth, number // len(every))
     test, rng = given.measurement, np.random.default_rng((number, CASES.index(case), 57))
@@ -112,6 +113,12 @@ def one_test(task: tuple[str, int, tuple[int, ...]]) -> Found:
     at = [wrong] if case != "base" else np.flatnonzero(np.abs(test.rigid_body[:, axis]) > 0.7)
     closely = len(at) > 0 and np.sum(known[at] ** -2.0) ** -0.5 < KNOWN and (case != "base" or len(at) > 2)
     return Found(name, case, channel in told if closely else None, None, [], {}, said)
+
+
+@lru_cache
+def _of(numbers: tuple[int, ...]) -> list[Continuous]:
+    """Those with few modes in the lines, and sensors for all of them."""
+    return [one for one in map(structure, numbers) if one.count <= MODES and len(one.modes.shapes) >= one.count]
 
 
 def _misread(test: sysid.Measurement, factor: np.ndarray) -> sysid.Measurement:
