@@ -194,7 +194,7 @@ def _clocks(test: Measurement) -> NDArray[np.intp]:
 def _joined(test: Measurement) -> Measurement:
     """Sensors and force as channels of a test whose base carries nothing along, as terms without poles are free."""
     if test.force is None:
-        return replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
+        return replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None, gain_std=None)
     std, force_std = test.response_std, test.force_std
     if std is not None:
         if force_std is None:
@@ -203,7 +203,7 @@ def _joined(test: Measurement) -> Measurement:
     response = np.concatenate([test.response, test.force], axis=1)
     return replace(
         test, response=response, rigid_body=np.zeros((response.shape[1], test.n_base)), sensors=None,
-        response_std=std, force=None, force_std=None,
+        response_std=std, force=None, force_std=None, gain_std=None,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from sysid import Problem, Sensor, Structure, simulate
 from sysid.assessment.checks.gains import GainErrors
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.jobs.changes import drawn_from
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.fit import whole_fit
@@ -226,6 +227,13 @@ def test_functions_for_unit_motion_stay_so(spectra):
     plain, unit = without_gains(moved, errors), without_gains(spectra, errors)
     np.testing.assert_allclose(unit.response, plain.response / (plain.base / moved.base), rtol=1e-8)
     np.testing.assert_allclose(unit.force, plain.force / (plain.base / moved.base), rtol=1e-8)
+
+
+def test_late_channels_are_found_beside_tolerances(spectra):
+    late = without_delays(spectra, -np.array([0.0, 0.002, 0.0, 0.0, 0.0]))
+    errors = np.array([0.004, -0.003, 0.006, 0.0, 0.002, 0.0])
+    result = sysid.identify(Problem(dataclasses.replace(misread(late, errors), **TOLERANCES)), rng=0)
+    assert result.determined and result.findings[0].kind == "late sensor" and result.findings[0].channel == "sensor 2"
 
 
 def test_what_gains_make_of_channels(records):
