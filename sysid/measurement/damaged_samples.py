@@ -232,7 +232,7 @@ def _held(
 def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: float) -> NDArray[np.bool_]:
     """Which stretches (k, 2) are no rest: a base may stand still between bursts, while sensors ring.
 
-    So may any channel with all of the base and, at an end of a record, with one axis of it or with most others.
+    So may any channel with all of the base and, at an end of a record, with one axis of it or with a tenth of the others.
     """
     if channel < n_base or not len(at):
         return np.zeros(len(at), dtype=bool)
@@ -240,7 +240,7 @@ def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: f
     least = lively**2 * np.var(records, axis=1)
     moves = np.array([(away[:, first : last + 1].mean(axis=1) > least) | (least == 0) for first, last in at])
     at_end, base = np.any((at == 0) | (at == records.shape[1] - 1), axis=1), moves[:, :n_base]
-    others = np.mean(np.delete(moves, channel, axis=1), axis=1) >= 0.5
+    others = np.mean(np.delete(moves, channel, axis=1), axis=1) > 0.9
     return np.where(at_end, np.all(base, axis=1) & others, np.any(base, axis=1))
 
 
@@ -292,6 +292,7 @@ class _Errors:
         times = heights / usual
         least = [[apart * np.max(its[its < out])] for its in times]
         level = np.maximum(level, least * usual)
+        level[heights <= level] = np.inf  # what is taken off may leave more where it was in balance
         for _ in range(most):
             times = np.where(heights > level, heights / usual, 0.0)
             more, at = divmod(int(np.argmax(times)), single.size)
@@ -302,12 +303,14 @@ class _Errors:
             single -= error * (np.roll(pulse, at) + more * np.roll(pulse, at + 1))
             heights = _heights(single[None], self.filters[[channel]])[0]
 
-    def is_alone(self, channel: int, first: int, foot: int = 3, hit: float = 5.0) -> bool:
-        """True where no other channel stands out: else the structure was hit."""
+    def is_alone(self, channel: int, first: int, foot: int = 3, far: int = 32, hit: float = 5.0) -> bool:
+        """True where no other channel stands out, nor more about it: else the structure was hit."""
         part = np.searchsorted(self.parts, first, side="right") - 1
-        tops = self.heights[:, :, max(first - foot, 0) : first + foot + 1].max(axis=2)
-        times = np.max(tops / self.usual[:, :, part], axis=1)
-        return not np.any(np.delete(times, channel) > hit)
+        near, about = (
+            np.max(self.heights[:, :, max(first - reach, 0) : first + reach + 1].max(axis=2) / self.usual[:, :, part], 1)
+            for reach in (foot, far)
+        )
+        return not np.any(np.delete((near > hit) | (about > near[channel]), channel))
 
 
 def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
