@@ -277,23 +277,26 @@ class _Errors:
         """
         heights, level, usual = self.heights[channel], self.level[channel], self.usual[channel]
         if not np.any(np.maximum.reduceat(heights, self.parts[:-1], axis=1) > level):
-            return
-        single, pulse = self.single[channel].copy(), scipy.fft.irfft(self.filters[channel], self.single.shape[1])
+            return  # of most channels
+        pulse = scipy.fft.irfft(self.filters[channel], heights.shape[1])
         pulse /= pulse[0]
         usual, level = (np.repeat(part, np.diff(self.parts), axis=1) for part in (usual, level))
         times = heights / usual
-        least = [[apart * np.max(its[its < out])] for its in times]
-        level = np.maximum(level, least * usual)
-        level[heights <= level] = np.inf  # what is taken off may leave more where it was in balance
-        for _ in range(most):
-            times = np.where(heights > level, heights / usual, 0.0)
-            more, at = divmod(int(np.argmax(times)), single.size)
-            if times[more, at] == 0.0:
+        level = np.maximum(level, [[apart * np.max(its[its < out])] for its in times] * usual)
+        more, at = np.nonzero(heights > level)
+        usual, level = usual[more, at], level[more, at]
+        first, second = np.take(self.single[channel], [at, at + 1], mode="wrap")
+        for _ in range(min(most, at.size)):
+            error = np.where(more, (first + second) / (2 + 2 * pulse[1]), first)
+            times = np.where(np.abs(error) > level, np.abs(error) / usual, 0.0)
+            top = int(np.argmax(times))
+            if times[top] == 0.0:
                 return
-            yield at, at + more, float(heights[more, at])
-            error = (single[at] + more * single[at - single.size + 1]) / (1 + more * (1 + 2 * pulse[1]))
-            single -= error * (np.roll(pulse, at) + more * np.roll(pulse, at + 1))
-            heights = _heights(single[None], self.filters[[channel]])[0]
+            yield int(at[top]), int(at[top] + more[top]), float(np.abs(error[top]))
+            away = at - at[top]
+            before, here, behind = np.take(pulse, [away - 1, away, away + 1], mode="wrap")
+            first -= error[top] * (here + more[top] * before)
+            second -= error[top] * (behind + more[top] * here)
 
     def is_alone(self, channel: int, first: int, foot: int = 3, far: int = 32, hit: float = 5.0) -> bool:
         """True where no other channel stands out, nor more about it: else the structure was hit."""
