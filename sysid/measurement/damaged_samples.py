@@ -324,6 +324,8 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
             steps = np.abs(np.diff(records[channel, max(first - clear, 0) : last + clear]))
             sides = np.median(steps[: clear - 2]), np.median(steps[2 - clear :])
             near |= not clear <= first < n - clear or min(sides) < 0.1 * max(sides)
+            beside = records[channel, [first - 1, (last + 1) % n]].mean()
+            near |= abs(records[channel, first] - beside) < 0.25 * size  # what the filter makes of a smooth pulse
             if not near and errors.is_alone(channel, first):
                 flags[first : last + 1] = True
                 sizes.append(size)
