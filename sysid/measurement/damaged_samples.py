@@ -318,7 +318,7 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
     for channel in range(len(records)):
-        flags, sizes = np.zeros(n, dtype=bool), [0.0]
+        sizes = np.zeros(n)
         for first, last, size in errors.highest(channel):
             near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
             steps = np.abs(np.diff(records[channel, max(first - clear, 0) : last + clear]))
@@ -327,10 +327,11 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
             beside = records[channel, [first - 1, (last + 1) % n]].mean()
             near |= abs(records[channel, first] - beside) < 0.25 * size  # what the filter makes of a smooth pulse
             if not near and errors.is_alone(channel, first):
-                flags[first : last + 1] = True
-                sizes.append(size)
-        if np.any(flags):
-            yield DamagedSamples("spikes", channel, _runs(flags), max(sizes))
+                sizes[first : last + 1] = size
+        runs = _runs(sizes > 0)
+        runs = runs[runs[:, 1] - runs[:, 0] < 2]  # longer ones are pulses
+        if len(runs):
+            yield DamagedSamples("spikes", channel, runs, float(sizes[runs].max()))
 
 
 def _filtered(records: Array) -> tuple[Array, Array]:
