@@ -10,6 +10,7 @@ alarms for all channels and samples of a run:
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -67,16 +68,10 @@ def damaged_samples(records: Array, n_base: int = 1) -> list[DamagedSamples]:
     """
     if records.shape[1] < _AROUND:
         return []
-    found = list(_equal(records, n_base))
-    held: list[Stretches] = []
-    quanta = [_quantum(record) for record in records]
-    for channel, quantum in enumerate(quanta):
-        stretches = [np.zeros((0, 2), np.intp)]
-        for one in _flat(records, channel, quantum, n_base):
-            found.append(one)
-            stretches.append(one.stretches)
-        held.append(np.concatenate(stretches))
-    found += _spikes(records, np.array(quanta), held)
+    quanta = np.array([_quantum(record) for record in records])
+    flat = [list(_flat(records, channel, quantum, n_base)) for channel, quantum in enumerate(quanta)]
+    held = [np.concatenate([np.zeros((0, 2), np.intp), *(one.stretches for one in its)]) for its in flat]
+    found = [*_equal(records, n_base), *itertools.chain(*flat), *_spikes(records, quanta, held)]
     sound = np.delete(np.arange(len(records)), [one.channel for one in found])
     found += [replace(one, channel=int(sound[one.channel])) for one in _tones(records[sound])]
     return sorted(found, key=lambda one: one.channel)
@@ -141,15 +136,16 @@ def _flat(records: Array, channel: int, quantum: float, n_base: int, lively: flo
     tops = [at for at, log, rest in zip(ends, logs, is_rest, strict=True) if log < chance and not rest]
     clipped = np.concatenate([np.zeros((0, 2), np.intp), *tops])
     if len(clipped):
-        yield _damage("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
+        clipped = clipped[np.argsort(clipped[:, 0])]
+        yield DamagedSamples("clipped", channel, clipped, float(np.abs(record[clipped[:, 0]]).max()))
     at = at[(at[:, 1] - at[:, 0] > 1) & ~np.isin(at[:, 0], clipped[:, 0])]
     at = at[_held(record, at, quantum, FALSE_ALARM / records.size, lively)]
     at = at[_no_rest(records, channel, at, n_base, lively)]
     zero = np.abs(record[at[:, 0]]) <= tolerance
     if np.any(zero):
-        yield _damage("dropout", channel, at[zero], 0.0)
+        yield DamagedSamples("dropout", channel, at[zero], 0.0)
     if not np.all(zero):
-        yield _damage("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
+        yield DamagedSamples("held value", channel, at[~zero], float(record[at[~zero][0, 0]]))
 
 
 def _alike(record: Array) -> Stretches:
@@ -166,10 +162,6 @@ def _is_slow(record: Array, at: Stretches) -> bool:
     between = (value < record.max() - tolerance) & (value > record.min() + tolerance)
     length = (at[:, 1] - at[:, 0] + 1)[between & _is_large(record)[at[:, 0]]]
     return len(at) == 1 or (length.size > 0 and bool(np.median(length) > 1))
-
-
-def _damage(kind: Damage, channel: int, stretches: Stretches, value: float) -> DamagedSamples:
-    return DamagedSamples(kind, channel, stretches[np.argsort(stretches[:, 0])], value)
 
 
 def _log_chance_of_tops(record: Array, at: Stretches, quantum: float, nearest: int = 8, more: float = 1.5) -> float:
@@ -232,7 +224,7 @@ def _held(
 def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: float) -> NDArray[np.bool_]:
     """Which stretches (k, 2) are no rest: a base may stand still between bursts, while sensors ring.
 
-    So may any channel with all of the base and, at an end of a record, with one axis of it or with most others.
+    So may any channel with the base and, at an end of a record, with one axis of it or a tenth of the others.
     """
     if channel < n_base or not len(at):
         return np.zeros(len(at), dtype=bool)
@@ -240,7 +232,7 @@ def _no_rest(records: Array, channel: int, at: Stretches, n_base: int, lively: f
     least = lively**2 * np.var(records, axis=1)
     moves = np.array([(away[:, first : last + 1].mean(axis=1) > least) | (least == 0) for first, last in at])
     at_end, base = np.any((at == 0) | (at == records.shape[1] - 1), axis=1), moves[:, :n_base]
-    others = np.mean(np.delete(moves, channel, axis=1), axis=1) >= 0.5
+    others = np.mean(np.delete(moves, channel, axis=1), axis=1) > 0.9
     return np.where(at_end, np.all(base, axis=1) & others, np.any(base, axis=1))
 
 
@@ -285,29 +277,35 @@ class _Errors:
         """
         heights, level, usual = self.heights[channel], self.level[channel], self.usual[channel]
         if not np.any(np.maximum.reduceat(heights, self.parts[:-1], axis=1) > level):
-            return
-        single, pulse = self.single[channel].copy(), scipy.fft.irfft(self.filters[channel], self.single.shape[1])
+            return  # of most channels
+        pulse = scipy.fft.irfft(self.filters[channel], heights.shape[1])
         pulse /= pulse[0]
         usual, level = (np.repeat(part, np.diff(self.parts), axis=1) for part in (usual, level))
         times = heights / usual
-        least = [[apart * np.max(its[its < out])] for its in times]
-        level = np.maximum(level, least * usual)
-        for _ in range(most):
-            times = np.where(heights > level, heights / usual, 0.0)
-            more, at = divmod(int(np.argmax(times)), single.size)
-            if times[more, at] == 0.0:
+        level = np.maximum(level, [[apart * np.max(its[its < out])] for its in times] * usual)
+        more, at = np.nonzero(heights > level)
+        usual, level = usual[more, at], level[more, at]
+        first, second = np.take(self.single[channel], [at, at + 1], mode="wrap")
+        for _ in range(min(most, at.size)):
+            error = np.where(more, (first + second) / (2 + 2 * pulse[1]), first)
+            times = np.where(np.abs(error) > level, np.abs(error) / usual, 0.0)
+            top = int(np.argmax(times))
+            if times[top] == 0.0:
                 return
-            yield at, at + more, float(heights[more, at])
-            error = (single[at] + more * single[at - single.size + 1]) / (1 + more * (1 + 2 * pulse[1]))
-            single -= error * (np.roll(pulse, at) + more * np.roll(pulse, at + 1))
-            heights = _heights(single[None], self.filters[[channel]])[0]
+            yield int(at[top]), int(at[top] + more[top]), float(np.abs(error[top]))
+            away = at - at[top]
+            before, here, behind = np.take(pulse, [away - 1, away, away + 1], mode="wrap")
+            first -= error[top] * (here + more[top] * before)
+            second -= error[top] * (behind + more[top] * here)
 
-    def is_alone(self, channel: int, first: int, foot: int = 3, hit: float = 5.0) -> bool:
-        """True where no other channel stands out: else the structure was hit."""
-        part = np.searchsorted(self.parts, first, side="right") - 1
-        tops = self.heights[:, :, max(first - foot, 0) : first + foot + 1].max(axis=2)
-        times = np.max(tops / self.usual[:, :, part], axis=1)
-        return not np.any(np.delete(times, channel) > hit)
+    def is_alone(self, channel: int, first: int, foot: int = 3, far: int = 32, hit: float = 5.0) -> bool:
+        """True where no other channel stands out, nor more about it: else the structure was hit."""
+        usual = self.usual[:, :, np.searchsorted(self.parts, first, side="right") - 1]
+        near, about = (
+            np.max(self.heights[:, :, max(first - r, 0) : first + r + 1].max(axis=2) / usual, axis=1)
+            for r in (foot, far)
+        )
+        return not np.any(np.delete((near > hit) | (about > near[channel]), channel))
 
 
 def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 16) -> Iterator[DamagedSamples]:
@@ -320,17 +318,20 @@ def _spikes(records: Array, quanta: Array, held: list[Stretches], clear: int = 1
     n = records.shape[1]
     errors = _Errors.of(records, quanta)
     for channel in range(len(records)):
-        flags, sizes = np.zeros(n, dtype=bool), [0.0]
+        sizes = np.zeros(n)
         for first, last, size in errors.highest(channel):
             near = np.any((held[channel][:, 0] - clear <= first) & (first <= held[channel][:, 1] + clear))
             steps = np.abs(np.diff(records[channel, max(first - clear, 0) : last + clear]))
-            sides = [np.median(steps[: clear - 2]), np.median(steps[2 - clear :])]
-            starts = min(sides) < 0.1 * max(sides)
-            if clear <= first < n - clear and not near and not starts and errors.is_alone(channel, first):
-                flags[first : last + 1] = True
-                sizes.append(size)
-        if np.any(flags):
-            yield DamagedSamples("spikes", channel, _runs(flags), max(sizes))
+            sides = np.median(steps[: clear - 2]), np.median(steps[2 - clear :])
+            near |= not clear <= first < n - clear or min(sides) < 0.1 * max(sides)
+            beside = records[channel, [first - 1, (last + 1) % n]].mean()
+            near |= abs(records[channel, first] - beside) < 0.25 * size  # what the filter makes of a smooth pulse
+            if not near and errors.is_alone(channel, first):
+                sizes[first : last + 1] = size
+        runs = _runs(sizes > 0)
+        runs = runs[runs[:, 1] - runs[:, 0] < 2]  # longer ones are pulses
+        if len(runs):
+            yield DamagedSamples("spikes", channel, runs, float(sizes[runs].max()))
 
 
 def _filtered(records: Array) -> tuple[Array, Array]:
