@@ -8,7 +8,7 @@ import multiprocessing
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from typing import NamedTuple
 
 from benchmarks.line import HEADER, WIDTHS, Line, row, rule
@@ -23,8 +23,9 @@ def run(benchmarks: Sequence[Benchmark], reduced: bool, processes: int = 1) -> l
     begun = time.perf_counter()
     beside = [b for b in benchmarks if processes > 1 and not b.alone(reduced)]
     ends = []
-    with ProcessPoolExecutor(processes, _fresh_processes(), max_tasks_per_child=1) as pool:
-        for future in as_completed([pool.submit(_captured, b, reduced) for b in beside]):
+    context = _fresh_processes()
+    with ThreadPoolExecutor(processes) as pool:
+        for future in as_completed([pool.submit(_in_its_own_process, b, reduced, context) for b in beside]):
             text, end = future.result()
             print(text, end="", flush=True)
             ends.append(end)
@@ -42,6 +43,14 @@ def _fresh_processes() -> multiprocessing.context.BaseContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["sysid", "scipy.optimize", "scipy.stats", "scipy.signal", "matplotlib.pyplot"])
     return context
+
+
+def _in_its_own_process(
+    benchmark: Benchmark, reduced: bool, context: multiprocessing.context.BaseContext
+) -> tuple[str, End]:  # fmt: skip
+    """What `_captured` gives, from a pool of one: pools that renew their processes can wait for ever (Python 3.11)."""
+    with ProcessPoolExecutor(1, context) as pool:
+        return pool.submit(_captured, benchmark, reduced).result()
 
 
 class End(NamedTuple):
