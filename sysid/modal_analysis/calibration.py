@@ -86,6 +86,11 @@ class Calibration:
         return {"tolerance": self.tolerance, "values": self.values, "covariance": self.covariance}
 
 
+def calibrated(test: Measurement, calibration: Calibration | None) -> Measurement:
+    """The test without errors of its gains; as it is where all are exact."""
+    return test if calibration is None else calibration.taken_off(test)
+
+
 def stored_calibrations(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Calibration | None]:
     """Gains of the tests of a stored problem, those of their tolerances where none were found."""
     found: list[Calibration | None] = []

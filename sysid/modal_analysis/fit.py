@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, Stop
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.calibration import Calibration
+from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -261,7 +261,7 @@ def fit_modes(
         As `whole_fit` does.
     """
     values, calibration = None if delays is None else delays.values, calibration or Calibration.stated(test)
-    test = test if calibration is None else calibration.taken_off(test)
+    test = calibrated(test, calibration)
     if test.whole is None:
         turned = test if values is None else without_delays(test, values)
         return replace(ModalEstimate.of_lines(turned), delays=delays, calibration=calibration)

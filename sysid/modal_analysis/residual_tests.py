@@ -313,12 +313,13 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     plain_std = np.hypot(plain_std, plain - error)
     better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
     rigid, chi2 = _rigid(fit, beyond)
-    fitted = half_inverse(normal[:at, :at], ROUND_OFF) / size[:at, None]
+    fitted = half_inverse(normal[:at, :at], ROUND_OFF)
     half = np.zeros((fit.model.size, fitted.shape[1]))
-    half[asked[:at]] = fitted
+    half[asked[:at]] = fitted / size[:at, None]
+    of_constants = half @ (fitted.T @ normal[:at, at : at + n]) * size[at : at + n]
     return Gains(
-        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, _moves_by_gains(fit, half),
-        rigid, chi2,
+        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom,
+        _moves_by_gains(fit, half, of_constants), rigid, chi2,
     )  # fmt: skip
 
 
@@ -361,27 +362,28 @@ def _asked_of_gains(fit: RecordFit) -> NDArray[np.intp]:
     return np.setdiff1d(np.arange(fit.asked.delays), left_out)
 
 
-def _moves_by_gains(fit: RecordFit, half: Array) -> Array:
+def _moves_by_gains(fit: RecordFit, half: Array, of_constants: Array) -> Array:
     """See `Gains`; ``half half'`` is the inverse of the normal matrix of the fit.
 
-    A sensor that reads too much records `1 + error` times all its motion, transients included. Of a base that does, all
-    records are that much less of what they are taken to be.
+    A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
+    linear in it take the factor, and G u beside them moves the fit by `of_constants` (unknowns, n_sensors). Of a base
+    that reads too much, all records are that much less of what they are taken to be.
     """
     model, p, (n, d) = fit.model, fit.parameters, fit.test.rigid_body.shape
-    pulls = np.zeros((n + 2 * d, model.size))
+    pulls = np.zeros((2 * d, model.size))
     columns = {run.piece: model.chunk(p, run.at(slice(0, 1))).columns() for run in model.runs}
     for chunk in model.chunks(p):
         channels, base = chunk.predicted(chunk.run.base, chunk.motion), chunk.run.base
         at = columns[chunk.run.piece]
-        errors = {i: np.outer(np.arange(len(channels)) == i, 1.0) * row for i, row in enumerate(channels)}
-        of_force = {n + d + i - n: error for i, error in errors.items() if i >= n}
-        of_base = {n + j: -chunk.H[:, j] * base[j] for j in range(d)}
-        for gain, error in {**{i: errors[i] for i in range(n)}, **of_base, **of_force}.items():
+        of_base = [-chunk.H[:, j] * base[j] for j in range(d)]
+        of_force = [np.where(np.arange(len(channels))[:, None] == i, channels, 0.0) for i in range(n, len(channels))]
+        for pull, error in zip(pulls, of_base + of_force, strict=False):  # without a force its moves stay zero
             products = at.products(chunk.sums_of_errors(fit.levels, at, error), chunk.deviations(fit.levels)[0])
-            pulls[gain, at.unknowns] += products.gradient
-    moved = half @ (half.T @ pulls.T)
+            pull[at.unknowns] += products.gradient
     moves = np.zeros((model.index.size, n + 2 * d))
-    moves[: model.kept] = moved[: model.kept]
+    moves[: model.kept] = np.hstack([of_constants, half @ (half.T @ pulls.T)])[: model.kept]
+    by_sensor = moves[model.index.phi].reshape(n, -1, n + 2 * d)
+    by_sensor[np.arange(n), :, np.arange(n)] += p.modes.phi
     return moves
 
 

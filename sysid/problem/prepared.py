@@ -16,7 +16,7 @@ from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.calibration import Calibration, stored_calibrations
+from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -185,10 +185,7 @@ class Prepared(SearchSpace):
         calibrations = stored_calibrations(tree, tests)
         fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
         read = [
-            fit
-            and RecordFit.from_tree(
-                fit, without_delays(calibration.taken_off(test) if calibration else test, late.values)
-            )
+            fit and RecordFit.from_tree(fit, without_delays(calibrated(test, calibration), late.values))
             for fit, test, late, calibration in zip(fits, tests, delays, calibrations, strict=True)
         ]
         return cls(stated, delays=delays, fits=read, calibrations=calibrations)
@@ -202,7 +199,7 @@ class Prepared(SearchSpace):
     def validation(self) -> tuple[Measurement, ...]:
         """Tests that are predicted and never fitted, without delays of their own, and without errors of gains."""
         gains, tests = self.modal[0].calibration, (Clock.of(test).test for test in self.stated.validation)
-        return tuple(test if gains is None else gains.taken_off(test) for test in tests)
+        return tuple(calibrated(test, gains) for test in tests)
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:

@@ -23,6 +23,7 @@ from sysid.finding import (
 )
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.calibration import calibrated
 from sysid.modal_analysis.delays import Clock
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.misfit import without_transients_of
@@ -260,7 +261,7 @@ class Answer:
         Without errors of gains, which are those of the sensors of the problem's own test.
         """
         gains, clocks = self.modal[0].calibration, map(Clock.of, self.records.validation)
-        tests = (clock.test if gains is None else gains.taken_off(clock.test) for clock in clocks)
+        tests = (calibrated(clock.test, gains) for clock in clocks)
         return tuple(without_transients_of(test, self.structure) for test in tests)
 
     @property

@@ -13,7 +13,7 @@ from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.calibration import Calibration, stored_calibrations
+from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Delays, stored_delays
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
@@ -176,7 +176,7 @@ class StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
         test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
         (delays,), (calibration,) = stored_delays(tree, [test]), stored_calibrations(tree, [test])
-        on_clock = without_delays(calibration.taken_off(test) if calibration else test, delays.values)
+        on_clock = without_delays(calibrated(test, calibration), delays.values)
         return cls(
             test,
             None if tree["reference"] is None else Structure.from_tree(tree["reference"]),

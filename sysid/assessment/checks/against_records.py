@@ -68,12 +68,12 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (1 + velocity):
         return leaks
     free = records.fit(*poles, velocity=velocity)
-    errors = gain_errors(modal, structure)
+    errors = None if changing else gain_errors(modal, structure)  # which a change of frequencies would explain
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
-    rocking = [] if changing else list(rocking_table(test, errors))
+    rocking = [] if errors is None else list(rocking_table(test, errors))
     if not (changing or rocking or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
-    gains = rocking or ([] if rigid or changing else list(wrong_gains(test, errors)))
+    gains = rocking or ([] if rigid or errors is None else list(wrong_gains(test, errors)))
     found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):
