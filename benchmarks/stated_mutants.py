@@ -213,7 +213,7 @@ TRIED = (
         "test_static_modes::test_the_unknowns_of_a_model_with_them_are_what_its_normal_matrix_holds"),
     Mutant("K36", "poles that stood for modes above the lines stay beside the static modes",
         "kept = worthwhile(self.records, omega, ratios, held=1)", "kept = np.arange(omega.size)",
-        "test_static_modes::test_poles_that_stood_for_modes_above_the_lines_go"),
+        "test_static_modes::test_a_pole_above_the_lines_goes_where_static_modes_do_as_well"),
     Mutant("K37", "superelements with the base among the residual modes", "n = len(form.mass) - structure.n_base",
         "n = structure.n", "test_other_programs::test_files_of_an_answer_in_the_band_hold_its_residual_modes"),
     Mutant("K41", "no further pole above the lines beside static modes",

@@ -6,10 +6,12 @@ import multiprocessing
 import os
 import signal
 import sys
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing.context import BaseContext
+from multiprocessing.util import Finalize
 from typing import Any, TypeVar, cast
 
 from sysid.errors import InputError, needed, whole_number
@@ -59,7 +61,7 @@ class _Maker:
     def __call__(self) -> Executor:
         if self._pool is None or self._pool.over:
             with _environment_of_workers():  # the first pool starts a process that looks after what all share
-                self._pool = _Processes(self._count, _context(), initializer=_end_at_interrupt)
+                self._pool = _Processes(self._count, _context())
         return self._pool
 
 
@@ -76,6 +78,12 @@ class _Processes(ProcessPoolExecutor):
     """Processes that Ctrl-C ends without a word, while they still import too; `over` is a pool that was shut down."""
 
     over = False
+
+    def __init__(self, count: int, context: BaseContext) -> None:
+        super().__init__(count, context, initializer=_end_at_interrupt)
+        # At its end a process of multiprocessing ends its queues, with priority 10, and waits for its children: workers
+        # that still waited for tasks would do so for ever.
+        Finalize(self, _shut, (weakref.ref(self),), exitpriority=20)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no further tasks."""
@@ -94,6 +102,12 @@ class _Processes(ProcessPoolExecutor):
             self.shutdown(wait=False, cancel_futures=True)
             for worker in workers:
                 worker.terminate()
+
+
+def _shut(pool: weakref.ref[_Processes]) -> None:
+    """Shut a pool down that is still there at this process's end."""
+    if (left := pool()) is not None:
+        left.shutdown()
 
 
 @contextmanager

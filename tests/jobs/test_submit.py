@@ -10,6 +10,7 @@ import sys
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +165,28 @@ def test_workers_of_one_maker_start_once_and_have_one_thread_and_those_given_up_
 def test_what_a_worker_raises_is_the_answer_of_its_task_alone():
     answers = list(each(eval, ["1/0", "2"], processes(1), lambda task, why: (task, why)))
     assert sorted(map(str, answers)) == [str(("1/0", "its worker failed (ZeroDivisionError: division by zero)")), "2"]
+
+
+def _leave_a_pool(told):
+    """Have a task done and end, with the pool still there; tell, just before queues end, whether it was shut down."""
+    make = processes(1)
+    pool = make()
+    pool.submit(abs, -1).result()
+    Finalize(pool, lambda: told.send(pool.over), exitpriority=15)
+
+
+def test_a_process_may_end_with_a_pool_left_open():
+    """Its workers would wait for ever, now and then, if its queues ended first."""
+    context = get_context("spawn")
+    heard, told = context.Pipe(duplex=False)
+    process = context.Process(target=_leave_a_pool, args=(told,))
+    process.start()
+    try:
+        assert heard.poll(60) and heard.recv() is True
+        process.join(60)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
 
 
 def test_a_pool_of_the_callers_own_is_not_built_again():

@@ -14,6 +14,9 @@ from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter_over_blocks
+from sysid.modal_analysis.spectra_modes import ModeFit
+from sysid.modal_analysis.vector_fitting import Poles
+from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Structure
 
 pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
@@ -203,6 +206,22 @@ def test_poles_that_stood_for_modes_above_the_lines_go():
     truth = continuous_structure(6)
     result = sysid.identify(sysid.Problem(draw(truth).measurement, mass=sysid.FullMass()), rng=0)
     assert result.structure.n == truth.count == 5 and result.structure.residual.static == 3 and result.determined
+
+
+@pytest.mark.parametrize("times", [1.1, 1.5])
+def test_a_pole_above_the_lines_goes_where_static_modes_do_as_well(truth, times):
+    """A fit that came to no end with a pole beyond the last line; under 2 % of noise nothing is left for it to do."""
+    freq = np.linspace(2.0, 15.0, 400)
+    spectra = sysid.simulate(truth, freq, noise=0.02, force=True, rng=0)
+    within = 2 * np.pi * truth.natural_frequencies[:4]
+    omega = np.append(within, 2 * np.pi * times * freq[-1])
+    poles = Poles(omega, np.append(truth.damping_ratios[:4], 0.05), 1.0)
+    fit = ModeFit(spectra, poles, np.sqrt(np.diag(truth.rigid_body_mass)), IterationMonitor(None, None), 300)
+    stopped = replace(fit, max_iterations=1).of_modes(np.ones(5, dtype=int))
+    found = fit.with_static(stopped)
+    assert stopped.status != "settled" and stopped.modes.omega.max() > 2 * np.pi * freq[-1]
+    assert found.static == 2 and np.sort(found.modes.omega)[:4] == pytest.approx(within, rel=3e-3)
+    assert np.sort(found.modes.omega)[4:] == pytest.approx(2 * np.pi * 2 * freq[-1])
 
 
 def test_a_pole_that_noise_explains_once_they_are_there_is_no_mode():
