@@ -202,6 +202,10 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
         help="of TEST.h5: tolerance of the gains of all channels, base and force included, as a standard deviation, "
         "such as 0.005; those that the sensors' list states, exact where it states none",
     )  # fmt: skip
+    run.add_argument(
+        "--at-rest", action="store_true", default=None,
+        help="of TEST.h5: all records begin and end at rest, or were tapered to it, and have no transients",
+    )  # fmt: skip
 
 
 def _add_modal_options(command: argparse.ArgumentParser) -> None:

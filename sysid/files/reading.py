@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, path_of, refuse
-from sysid.files import arrays, assembly, delimited, responses, universal, xsens_dot
+from sysid.files import arrays, assembly, delimited, lvm, responses, strong_motion, universal, xsens_dot
 from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
 from sysid.files.recording import Recording, recognised
@@ -17,6 +17,8 @@ _TEXT = (".csv", ".txt", ".tsv", ".asc", ".dat")
 _UNIVERSAL = (".uff", ".unv", ".ufb")
 _READERS: dict[str, Callable[[Path], list[Recording]]] = {
     **dict.fromkeys(_TEXT, delimited.read_delimited),
+    ".lvm": lvm.read_lvm,
+    ".v2": strong_motion.read_strong_motion,
     ".npz": arrays.read_npz,
     ".mat": arrays.read_mat,
     **dict.fromkeys((".h5", ".hdf5"), arrays.read_hdf5),
@@ -34,8 +36,9 @@ def read(
     Parameters
     ----------
     paths : path or sequence of paths
-        CSV and other text tables, MATLAB files, universal files with sets 58 or 58b, HDF5, NPZ; each file is a run,
-        unless `sensors` has ``join = true``: then the files of a folder are.
+        CSV and other text tables, LabVIEW measurement files, MATLAB files, universal files with sets 58 or 58b, HDF5,
+        NPZ, corrected strong-motion records (.V2); each file is a run, unless `sensors` has ``join = true``: then the
+        files of a folder are, or those of a folder whose names differ by those of the sensors alone.
     sensors : path or mapping, optional
         Which column is which sensor: a TOML file, or the same as dictionaries and lists. By default the TOML file
         beside the first file: of its name, or ``sensors.toml``.
@@ -72,10 +75,10 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         _check_file(file)
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
-        return assembly.assembled_in_time([xsens_dot.together(files, said)], said)  # a unit is a file
+        return assembly.assembled_in_time(xsens_dot.together(files, said), said)  # a unit is a file
     recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
-        recordings = assembly.by_folder(recordings, said)
+        recordings = assembly.joined(recordings, said)
     else:
         refuse((said.align, f"{said.place}: align goes with join: a file of its own is on one clock"))
         _check_one_each(recordings, said)
@@ -96,7 +99,7 @@ def _check_file(file: Path) -> None:
     words = (
         f"{size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, .h5 or .npz,"
     )
-    long = file.suffix.lower() in _TEXT and size > 2**30
+    long = file.suffix.lower() in (*_TEXT, ".lvm", ".v2") and size > 2**30
     refuse((long, f"{file} has {words} or fewer channels or minutes a file"))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
 from sysid.files.assembly import (
+    base_differences,
     base_directions,
     delays_in_words,
     described,
@@ -127,6 +128,7 @@ def _run(
     _check_responses(parts, said, reference, recording)
     has_base = any(channel.role == "base" for channel, _ in parts)
     moved = None if has_base else _unit_motion(lower, reference, axes, recording, freq)
+    base_differences(parts, said, axes, str(recording.path))  # refuses
     return run_of(parts, said, axes, str(recording.path), moved), rows
 
 
