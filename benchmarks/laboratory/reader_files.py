@@ -157,6 +157,11 @@ def labview() -> list[Case]:
         names=["table", "Untitled", "top"], units=["g", "", "m/s^2"], samples=[SAMPLES, 0, SAMPLES],
         segments=[np.array([TABLE, np.full(SAMPLES, np.nan), TOP])],
     )  # fmt: skip
+    once = np.where(np.arange(SAMPLES) < 1, THIRD, np.nan)
+    packets = file(
+        names=["table", "slow", "top"], units=["g", "g", "m/s^2"], samples=[SAMPLES, 1, SAMPLES], headings=False,
+        segments=[np.array([a, once, b]) for a, b in thirds], steps=[1 / RATE, 1.0, 1 / RATE],
+    )  # fmt: skip
     freq = np.arange(1, SAMPLES + 1)
     H = 1 / (1 - (freq / 80) ** 2 + 0.04j * freq / 80)
     H = rounded(H.real) + 1j * rounded(H.imag)
@@ -177,6 +182,9 @@ def labview() -> list[Case]:
         case("tabs between, decimal commas", file(comma=True)),
         case("no column of times", file(x_columns="No")),
         case("a column of times a channel", file(x_columns="Multi")),
+        case("an increment of few digits", file(x_columns="No", steps=["0.007813"] * 2)),
+        case("an increment of few digits beside times", file(steps=["0.007813"] * 2)),
+        case("slow channels in packets", packets, runs=[LONG * si_of], told="left out: slow"),
         case("times in ms", file(x_unit="ms")),
         case("comments", file(comment="LOST, then found")),
         case("a special block", file(special="Packet_Notes\nOperator\tMüller\nChannels\t9")),
@@ -201,6 +209,7 @@ def labview() -> list[Case]:
         case("another number of channels", file(replaced={"Channels\t2": "Channels\t3"}), "3 channels"),
         case("channels in letters", file(replaced={"Channels\t2": "Channels\ttwo"}), "'two'"),
         case("samples in letters", file(replaced={"Samples\t240": "Samples\tmany"}), "'many'"),
+        case("an increment of nothing", file(x_columns="No", steps=["0.000000"] * 2), "sample_rate"),
         case("no unit", file(units=["g", ""]), "no unit"),
         case("volts", file(units=["g", "Volts"]), "'Volts'"),
         case("neither times nor increment", file(x_columns="No", replaced={"Delta_X": "Other"}), "sample_rate"),
@@ -264,6 +273,7 @@ def strong_motion() -> list[Case]:
         case("no unit", bare, "no unit"),
         case("uncorrected, Volume 1", sound.replace("data equally spaced", "data"), "Volume 1"),
         case("of two intervals", unlike, "intervals of"),
+        case("of no interval", StrongMotion(two, values, step=0.0), "interval of 0 s"),
         case("the end marks are lost", sound.replace("End of data", "Data end"), "is cut short"),
         case("empty", "", "is empty"),
         case("an archive", b"PK\3\4" + bytes(range(256)) * 20, "CE24386.V2"),
@@ -316,6 +326,7 @@ def matlab() -> list[Case]:
         case("as many, version 7.3", lambda path: matlab_7_3(path, {"acc": square, "fs": np.array(RATE)}), "as many"),
         case("no rate", five(acc=BOTH), "sample_rate"),
         case("another rate than its times", five(acc=BOTH, t=times, fs=50.0), "the file's rate 50 Hz"),
+        case("a rate of nothing", five(acc=BOTH, fs=0.0), "sample_rate"),
         case("cut short", cut(five(acc=BOTH, fs=RATE)), "run.mat"),
         case("cut short, version 7.3", cut(lambda path: matlab_7_3(path, {"acc": BOTH})), "run.mat"),
         case("NaN in a row", five(acc=bad, fs=RATE), "sample 91"),

@@ -36,7 +36,7 @@ class Lvm:
     special: str = ""
     comment: str = ""
     samples: Sequence[int] | None = None
-    steps: Sequence[float] | None = None
+    steps: Sequence[float | str] | None = None
     x_unit: str = ""
     dimension: str = "Time"
     replaced: dict[str, str] = field(default_factory=dict)
@@ -74,7 +74,10 @@ class Lvm:
         steps = self.steps or [scale / self.rate] * count
         seconds = 47.0352557312499836422 + begin
         time = f"10:{45 + int(seconds // 60)}:{seconds % 60:.13f}"
-        numbers = [per("X0", ["0.0000000000000000E+0"] * count), per("Delta_X", [f"{step:.9E}" for step in steps])]
+        numbers = [
+            per("X0", ["0.0000000000000000E+0"] * count),
+            per("Delta_X", [step if isinstance(step, str) else f"{step:.9E}" for step in steps]),
+        ]
         tags = [f"Channels{s}{count}{s * count}", per("Samples", self.samples or [values.shape[1]] * count),
                 per("Date", ["2026/03/17"] * count), per("Time", [time] * count),
                 *([per("X_Unit_Label", [self.x_unit] * count)] if self.x_unit else []),

@@ -174,7 +174,7 @@ def _rate(recording: Recording, said: Description) -> float:
     column = next(iter(_time_columns(recording, said)), None)
     if column is None:
         rate = said.sample_rate or recording.sample_rate
-        if rate is None:
+        if rate is None or not 0 < rate < np.inf:
             raise InputError(
                 f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in '
                 f"Hz (--time, --rate); {recording.in_words()}"
@@ -186,12 +186,10 @@ def _rate(recording: Recording, said: Description) -> float:
     check_column(column, recording.path)
     rate = rate_of(np.real(column.values) * known.factor, recording.path, column.place)
     stated, of = (said.sample_rate, "sample_rate") if said.sample_rate else (recording.sample_rate, "the file's rate")
-    if stated is None:
-        near = float(f"{rate:.6g}")  # without what rounding of the times in a file adds to it
-        return near if abs(near / rate - 1) * column.values.size < 0.05 else rate
-    words = f"time tells {rate:g} Hz and {of} {stated:g} Hz; is time in another unit than s? State one of them"
-    refuse((abs(rate / stated - 1) > 0.01, f"{place}: {words}"))
-    return stated
+    near = stated or float(f"{rate:.6g}")  # without what rounding of the times in a file adds to it
+    words = f"time tells {rate:g} Hz and {of} {near:g} Hz; is time in another unit than s? State one of them"
+    refuse((abs(rate / near - 1) > 0.01, f"{place}: {words}"))
+    return said.sample_rate or (near if abs(near / rate - 1) * column.values.size < 0.05 else rate)
 
 
 def _time_columns(recording: Recording, said: Description) -> list[Column]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -118,14 +119,24 @@ def _segment(rows: Rows, form: Form, several: bool, path: Path) -> _Segment:
     remarks = (f"channels of another number of samples, rate or begin are left out: {other}",) * bool(other)
     scale = units.unit(stated("X_Unit_Label", first) or unit, f"{place}: x-values").factor
     begin = _clock(stated("Date", first), form.numbers([stated("Time", first)])) + scale * number("X0", first)
-    step *= scale * (dimension == "Time")
+    step = scale * _increment(step) * (dimension == "Time")
     return _Segment(tuple(columns), step, begin, begin + step * len(body), remarks)
+
+
+def _increment(step: float) -> float:
+    """An increment in time, of which LabVIEW may write few digits: that of the shortest rate that they allow."""
+    last = Decimal(str(step)).as_tuple().exponent
+    if not step > 0 or not isinstance(last, int) or last > -6:
+        return step  # all of it stands there
+    shortest = (float(f"{1 / step:.{n}g}") for n in range(1, 18))
+    return 1 / next((rate for rate in shortest if abs(1 / rate - step) <= 0.50001 * 10.0**last), 1 / step)
 
 
 def _clock(date: str, time: Sequence[complex] | None) -> float:
     """Seconds of a date and a time of day; NaN where they are not understood."""
     try:
-        return datetime.strptime(date, "%Y/%m/%d").toordinal() * 86400.0 + float(np.real((time or [np.nan])[0]))
+        days = (datetime.strptime(date, "%Y/%m/%d") - datetime(2000, 1, 1)).days
+        return days * 86400.0 + float(np.real((time or [np.nan])[0]))
     except ValueError:
         return float("nan")
 
@@ -148,8 +159,9 @@ def _recording(path: Path, run: list[_Segment]) -> Recording:
         remarks += (f"{len(run)} segments that follow each other without a gap are one run",)
         parts = [[one for one in segment.columns if one.name != _X] for segment in run]
         columns = [
-            replace(one[0], values=np.concatenate([part.values for part in one]), lines=None)
+            replace(
+                one[0], **{name: np.concatenate([getattr(part, name) for part in one]) for name in ("values", "lines")}
+            )
             for one in zip(*parts, strict=True)
         ]
-    rate = 1 / first.step if first.step > 0 else None
-    return Recording(path, tuple(columns), rate, remarks=remarks)
+    return Recording(path, tuple(columns), 1 / first.step if first.step > 0 else None, remarks=remarks)

@@ -55,7 +55,9 @@ def read_strong_motion(path: Path) -> list[Recording]:
     steps, lengths = {one.step for one in found}, {one.column.values.size for one in found}
     apart = f"{path}: its channels have intervals of {', '.join(f'{one:g}' for one in steps)} s and lengths of "
     apart += f"{', '.join(map(str, lengths))} samples: write those of one recorder to a file of their own"
-    refuse((len(steps) > 1 or len(lengths) > 1, apart))
+    refuse(
+        (min(steps) <= 0, f"{path} states an interval of {min(steps):g} s"), (len(steps) > 1 or len(lengths) > 1, apart)
+    )
     return [Recording(path, tuple(one.column for one in found), 1 / steps.pop(), remarks=tuple(_remarks(found)))]
 
 

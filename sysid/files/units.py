@@ -45,7 +45,7 @@ UNITS: dict[str, Unit] = {
     "rad/s": Unit("frequency", 1 / (2 * 3.141592653589793)),
 }
 _OTHER_WORDS = {
-    "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N",
+    "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N", "newtons": "N",
     "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
     "hz": "Hz", "kn": "kN", "n": "N", "G": "g", "g's": "g",
 }  # fmt: skip
