@@ -118,7 +118,7 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     extra = {name: value for name, value in said.items() if value is not None}
     if not is_test(given.module):
         refuse(
-            (extra, "--mass, --lumped, --band, --goal, --gain-std and --at-rest are for a test that 'sysid read' wrote")
+            (extra, "--mass, --lumped, --band, --gain-std, --at-rest and --goal are for a test that 'sysid read' wrote")
         )
         return given
     refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))

@@ -41,7 +41,7 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     axes = base_directions(said)
     runs, table, rates = [], [], []
     for recording in recordings:
-        rates.append(_rate(recording, said))
+        rates.append(recorded_rate(recording, said))
         records, rows = _records(recording, said)
         late = np.array([channel.delay for channel in said.channels])
         if np.any(late):
@@ -169,7 +169,7 @@ def base_directions(said: Description, channels_needed: bool = True) -> tuple[st
     return tuple(name for name in BASE_AXES if name in letters)
 
 
-def _rate(recording: Recording, said: Description) -> float:
+def recorded_rate(recording: Recording, said: Description) -> float:
     """Samples a second, Hz: by the column of time, else stated or of the file."""
     column = next(iter(_time_columns(recording, said)), None)
     if column is None:
@@ -393,7 +393,7 @@ def _begins(
     """
     clocks = []
     for recording, part in zip(recordings, parts, strict=True):
-        rate = _rate(recording, said)  # refuses a time of another unit
+        rate = recorded_rate(recording, said)  # refuses a time of another unit
         begin = sum(
             units.unit(one.unit or "s", one.place).factor * one.values[0] for one in _time_columns(recording, said)
         )

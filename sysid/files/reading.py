@@ -71,21 +71,26 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     """The test of some files, with its records whole; arguments as of `read`."""
     files = [path_of("paths", path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     refuse((not files, "paths is empty: give the files of a test"))
+    said = asked(sensors, files)
+    recordings = recordings_of(files, said)
+    spectra = {recording.freq is not None for recording in recordings}
+    refuse((len(spectra) > 1, "some files hold records in time and some spectra: read them apart"))
+    return responses.from_spectra(recordings, said) if spectra.pop() else assembly.assembled_in_time(recordings, said)
+
+
+def recordings_of(files: Sequence[Path], said: Description) -> list[Recording]:
+    """The runs of some files, as far as they can be told without knowing which column is which sensor."""
     for file in files:
         _check_file(file)
-    said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
-        return assembly.assembled_in_time(xsens_dot.together(files, said), said)  # a unit is a file
+        return xsens_dot.together(files, said)  # a unit is a file
     recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
         recordings = assembly.joined(recordings, said)
     else:
         refuse((said.align, f"{said.place}: align goes with join: a file of its own is on one clock"))
         _check_one_each(recordings, said)
-    recordings = [recognised(recording, said) for recording in recordings]
-    spectra = {recording.freq is not None for recording in recordings}
-    refuse((len(spectra) > 1, "some files hold records in time and some spectra: read them apart"))
-    return responses.from_spectra(recordings, said) if spectra.pop() else assembly.assembled_in_time(recordings, said)
+    return [recognised(recording, said) for recording in recordings]
 
 
 def _check_file(file: Path) -> None:
