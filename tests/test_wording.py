@@ -641,6 +641,8 @@ def test_what_a_file_leaves_open_is_remarked(here):
     )
     said = {"base_axes": "x", "frf": "transmissibility", "frequency": "w", "convention": "exp(+iwt)"}
     assert reading.gather(Path("frf.npz"), said | {"sensor": [top | {"column": "h1"}]}).remarks == (
+        "frf.npz: 1 line within the half-power width of its sharpest peak, too few for its damping: export finer lines "
+        "(longer blocks)",
         "frf.npz: array 'w': frequencies have no unit, and are taken as Hz", "spectra follow exp(+iwt), as stated",
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from sysid.cli.starting import MISTAKE, SUCCESS
 from sysid.errors import InputError, how_to_install
 from sysid.files.assembly import recorded_rate
 from sysid.files.description import asked
-from sysid.files.kind import channels_of, kind_of, lines_of_peak
+from sysid.files.kind import channels_of, coarse_lines, kind_of
 from sysid.files.reading import gather, recordings_of
 from sysid.results.version import __version__
 
@@ -96,7 +96,7 @@ def _look(names: list[str], out: Output) -> int:
     said, missing, runs = asked(None, files), list[str](), []
     base = [str(channel.column) for channel in said.channels if channel.role == "base"]
     for one in recordings_of(files, said):
-        kind, channels, peak, rate = kind_of(one, base), channels_of(one), lines_of_peak(one), ""
+        kind, channels, rate = kind_of(one, base), channels_of(one), ""
         if one.freq is None:
             with _told(missing):
                 rate = f" at {recorded_rate(one, said):g} Hz"
@@ -106,8 +106,7 @@ def _look(names: list[str], out: Output) -> int:
         for column in channels:
             out.write(f"  {column.name:<20} {column.unit or 'no unit':<10} {column.place}\n")
         out.write("".join(f"  {remark}\n" for remark in one.remarks))
-        few = f"{one.path}: finer lines: {peak} stand within the width of its sharpest peak, where five are needed"
-        missing += [few] * (0 < peak < 5)
+        missing += coarse_lines(one)
         runs.append({"file": str(one.path), "kind": kind, "channels": [column.name for column in channels]})
     with _told(missing):
         gather(files, said)

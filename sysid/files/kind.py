@@ -38,15 +38,21 @@ def channels_of(recording: Recording) -> list[Column]:
     return [one for one in recording.columns if not is_abscissa(one.name)]
 
 
-def lines_of_peak(recording: Recording) -> int:
-    """Lines within the half-power width of the sharpest of the largest peaks of its functions; 0 of records in time."""
+def coarse_lines(recording: Recording) -> list[str]:
+    """That in words where a function has fewer than three lines within the half-power width of its largest peak."""
     counts = []
     for one in channels_of(recording) if recording.freq is not None else []:
-        size = np.abs(one.values)
-        low = np.flatnonzero(~(size > np.max(size) / np.sqrt(2)))
-        at = int(np.argmax(size))
+        size, steps = np.abs(one.values), np.abs(np.diff(one.values))
+        # Real numbers are coherences or magnitudes; spectra of random motion differ from line to line.
+        if not np.any(np.imag(one.values)) or np.median(steps) > 0.5 * np.median(size):
+            continue
+        low, at = np.flatnonzero(~(size > np.max(size) / np.sqrt(2))), int(np.argmax(size))
         counts.append(int(min(low[low > at], default=size.size) - max(low[low < at], default=-1) - 1))
-    return min(counts, default=0)
+    fewest = min(counts, default=3)
+    words = (
+        "within the half-power width of its sharpest peak, too few for its damping: export finer lines (longer blocks)"
+    )
+    return [f"{recording.path}: {fewest} line{'s' * (fewest != 1)} {words}"] * (fewest < 3)
 
 
 def _periods(row: Array) -> Array:

@@ -80,8 +80,9 @@ def read_xsens_dot(path: str | Path) -> UnitRecord:
     time = pick((_TIME,))[0] * 1e-6
     acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))
     falls = np.diff(time) <= 0
+    bad = np.flatnonzero(~np.all(np.isfinite([time, *acceleration, *rotation]), axis=0))
     refuse(
-        (not np.all(np.isfinite([time, *acceleration, *rotation])), f"{file} holds NaN or infinite samples"),
+        (bad.size, f"{file} holds NaN or infinite samples at row {[*bad, 0][0] + 2} ({bad.size} such)"),
         (np.any(falls), f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}"),
     )
     return UnitRecord(time, acceleration, rotation)
