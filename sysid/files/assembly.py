@@ -327,16 +327,20 @@ def runs_of_files(files: Sequence[Path], said: Description) -> list[dict[Path, s
     A folder is a run. Where the names of its files are more than those of the sensors, such as ``run2_top`` of ``top``,
     files with the same rest are one.
     """
-    runs: dict[tuple[Path, str], dict[Path, str]] = {}
     columns = [one.column for one in said.channels if isinstance(one.column, str) and not one.column.isdecimal()]
     known = {".".join(parts[:n]) for parts in (name.split(".") for name in columns) for n in range(1, len(parts) + 1)}
-    whole = {file.parent for file in files if file.stem in known}
-    for file in files:
-        rest = {name: "|".join(re.split(rf"(?:^|[-_. ]){re.escape(name)}(?:[-_. ]|$)", file.stem)) for name in known}
-        found = [name for name in known if rest[name] != file.stem and file.parent not in whole]
-        name = max(found, key=len, default=file.stem)
-        runs.setdefault((file.parent, rest.get(name, "") if found else ""), {})[file] = name
-    return list(runs.values())
+    runs = []
+    for folder in dict.fromkeys(file.parent for file in files):
+        groups: dict[str, dict[Path, str]] = {}
+        whole = {file: file.stem for file in files if file.parent == folder}
+        for file in whole:
+            rests = {name: re.split(rf"(?:^|[-_. ]){re.escape(name)}(?:[-_. ]|$)", file.stem) for name in known}
+            if name := max((one for one in known if len(rests[one]) > 1), key=len, default=""):
+                groups.setdefault("|".join(rests[name]), {})[file] = name
+        # Names of sensors alone are a run, beside which other names are its further files, unless they are as complete.
+        complete = len({frozenset(one.values()) for one in groups.values()}) == 1 < len(groups)
+        runs += list(groups.values()) if groups and ("|" not in groups or complete) else [whole]
+    return runs
 
 
 def joined(recordings: Sequence[Recording], said: Description) -> list[Recording]:

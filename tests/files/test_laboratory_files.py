@@ -5,6 +5,7 @@ import pytest
 from scipy.io import savemat
 
 import sysid
+from sysid.cli import main as cli
 from sysid.files import reading, units
 
 G = 9.80665
@@ -150,3 +151,23 @@ def test_base_sensors_of_one_axis_are_told_by_their_differences(tmp_path):
 @pytest.mark.parametrize("text", ["cm/sec2", "CM/SEC/SEC", "cm/s/s", "cm/sec^2", "gal"])
 def test_units_of_strong_motion_files_are_known(text):
     assert units.find(text) == units.Unit("acceleration", 1e-2)
+
+
+@pytest.mark.parametrize("tapered", [True, False])
+def test_records_at_rest_at_both_ends_are_told_and_run_so(tmp_path, monkeypatch, capsys, no_pictures, tapered):
+    monkeypatch.chdir(tmp_path)
+    truth = sysid.Structure([[2.0, 0.0], [0.0, 0.0]], [[3e3, -3e3], [-3e3, 3e3]], [0.03], n_base=1)
+    base = np.random.default_rng(2).standard_normal((1, 800))
+    window = np.interp(np.arange(800), [0, 15, 60, 740, 785, 799], [0, 0, 1, 1, 0, 0]) if tapered else 1.0
+    top = truth.simulate(base, 50.0) * window
+    savemat(
+        "run.mat", {"a": base * window, "b": top + 1e-3 * np.random.default_rng(3).standard_normal((1, 800)) * window}
+    )
+    toml = [f'[[sensor]]\ncolumn = "{name}"\nrole = "{role}"\naxis = "x"\nunit = "g"\n' for name, role in
+            (("a", "base"), ("b", "response"))]  # fmt: skip
+    (tmp_path / "run.toml").write_text("sample_rate = 50.0\n" + "".join(toml))
+    assert cli.main(["read", "run.mat"]) == 0
+    assert ("--at-rest" in capsys.readouterr().out) == tapered
+    if tapered:
+        assert cli.main(["run", "test.h5", "--at-rest", "--out", "out"]) in (0, 1)
+        assert sysid.load("out").recipe.parameters["at_rest"] is True
