@@ -370,7 +370,7 @@ def joined() -> list[Case]:
     uneven = {**parted, "top.lvm": Lvm(["top"], ["g"], [TOP[None]]).text()}
     late = {**units, "two/top.csv": xsens_dot(2000.0 + time, TOP)}
     beside = {"table.csv": _csv(TABLE[None]), "top_left.csv": _csv(THIRD[None]), "top.csv": _csv(TOP[None])}
-    beside_2, missing = named("{run}_{sensor}.csv"), named("{run}_{sensor}.csv")
+    more, missing = named("{run}_{sensor}.csv"), named("{run}_{sensor}.csv")
     del missing["run2_top.csv"]
     several = {
         f"{run}-{name}.csv": _csv(rows, "x;y")
@@ -389,7 +389,7 @@ def joined() -> list[Case]:
         Case("the second run numbered", {file.replace("run1_", "").replace("run2_", "2 "): content for file, content in
              named("{run}_{sensor}.csv").items()}, toml, runs),
         Case("a sensor that is not described", beside, toml, runs[:1]),
-        Case("a sensor that is not described, in two runs", {**beside_2, "run1_spare.csv": _csv(THIRD[None])}, toml, runs),
+        Case("a sensor that is not described, in two runs", {**more, "run1_spare.csv": _csv(THIRD[None])}, toml, runs),
         Case("several columns a file", several, sensors("base.x", "roof.x", unit="g", top=join), runs),
         Case("runs of two lengths", named("{run}_{sensor}.csv", -BOTH[:, :200]), toml, [runs[0], runs[1][:, :200]]),
         Case("units of Xsens in two folders", units, dot_toml, [still, -still], rate=100.0, exact=1e-6),
