@@ -279,9 +279,7 @@ def base_differences(
     taken = _motions(base, said, axes) @ _base_motion(base, said, axes, place)
     sizes, off = (np.linalg.norm(one, axis=1) for one in (values, values - taken))
     words = f"{place}: {len(base)} base sensors along {' '.join(axes)}"
-    apart = (
-        "share less than half of what they record: mend a sign (axis), a unit or a gain, leave one out, or state how"
-    )
+    apart = "share less than half of what they record: mend a sign (axis), a unit or a gain, or state how"
     names = ", ".join(repr(one.name) for one, _ in base)
     wrong = np.linalg.norm(off) > 0.5 * np.linalg.norm(sizes)
     refuse((wrong, f'{words} ({names}) {apart} else the base moves, such as base_axes = "x rz"'))
@@ -349,8 +347,12 @@ def joined(recordings: Sequence[Recording], said: Description) -> list[Recording
     A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency. Refused are
     files of other times or rates, or longer than others by more than a hundredth, unless their clocks are aligned.
     """
-    runs = []
-    for names in runs_of_files(list(dict.fromkeys(one.path for one in recordings)), said):
+    runs, every = [], runs_of_files(list(dict.fromkeys(one.path for one in recordings)), said)
+    described = [part for one in said.channels for part in (str(one.column), str(one.column).partition(".")[0])]
+    for names in every:
+        lost = [one for other in every for one in other.values() if one in described and one not in names.values()]
+        words = f"its run has no file of {', '.join(map(repr, dict.fromkeys(lost)))}, as another has: name it too"
+        refuse((lost, f"{next(iter(names))}: {words}"))
         held = [[one for one in recordings if one.path == file] for file in names]
         counts = {len(one) for one in held}
         words = "hold other numbers of runs, and are to be joined: write each run to files of its own"

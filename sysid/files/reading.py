@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -111,13 +112,17 @@ def _check_file(file: Path) -> None:
 def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
     """Refuse files that seem to hold one sensor each, where they are read as a run each."""
     names = set(recordings[0].names)
-    others = {name: other.path for other in recordings[1:] for name in (*other.names, other.path.stem)}
+    held = [(name, one.path) for one in recordings[1:] for name in (*one.names, one.path.stem)]
     elsewhere = [str(channel.column) for channel in said.channels if str(channel.column) not in names]
-    found = next((name for name in elsewhere if name in others), None)
-    words = (
-        f"no column {found!r}, which {others.get(str(found))} is or has: does each file hold one sensor? Then read them"
-    )
-    refuse((found is not None, f"{recordings[0].path} has {words} with --join (join = true)"))
+    found = [
+        (one, path)
+        for one in elsewhere
+        for name, path in held
+        if one.partition(".")[0] in (name, *re.split("[-_ ]", name))
+    ]
+    lost, path = next(iter(found), ("", None))
+    words = f"no column {lost!r}, which {path} is or has: does each file hold one sensor? Then read them"
+    refuse((found, f"{recordings[0].path} has {words} with --join (join = true)"))
 
 
 def _read_any(file: Path) -> list[Recording]:

@@ -55,9 +55,7 @@ def read_strong_motion(path: Path) -> list[Recording]:
     steps, lengths = {one.step for one in found}, {one.column.values.size for one in found}
     apart = f"{path}: its channels have intervals of {', '.join(f'{one:g}' for one in steps)} s and lengths of "
     apart += f"{', '.join(map(str, lengths))} samples: write those of one recorder to a file of their own"
-    refuse(
-        (min(steps) <= 0, f"{path} states an interval of {min(steps):g} s"), (len(steps) > 1 or len(lengths) > 1, apart)
-    )
+    refuse((min(steps) <= 0, f"{path} states an interval of {min(steps):g} s"), (len(steps) * len(lengths) > 1, apart))
     return [Recording(path, tuple(one.column for one in found), 1 / steps.pop(), remarks=tuple(_remarks(found)))]
 
 
@@ -85,14 +83,12 @@ def _values(lines: Sequence[str], start: int, end: int, count: int, path: Path) 
     values: list[float] = []
     for at in range(start + 1, end):
         line = lines[at].rstrip()
-        fields = [line[place : place + width] for place in range(0, len(line), width)]
-        try:
-            values += map(float, fields)
-        except ValueError:
-            raise InputError(
-                f"{path}, line {at + 1}: {shown(line)} is no row of numbers of {width} digits each: is it damaged? "
-                "Download it again"
-            ) from None
+        for field in (line[place : place + width] for place in range(0, len(line), width)):
+            try:
+                values.append(float(field))
+            except ValueError:
+                words = f"holds {shown(field)} in the place of a number: is it damaged? Download it again"
+                raise InputError(f"{path}, line {at + 1}: {words}") from None
     words = f"it states {count} accelerations, and {len(values)} stand below it: is it cut, or damaged?"
     refuse((len(values) != count, f"{path}, line {start + 1}: {words} Download it again"))
     return np.array(values)
