@@ -23,7 +23,7 @@ def kind_of(recording: Recording, base: Sequence[str] = ()) -> str:
         return "too short to tell"
     periods = [_periods(row) for row in rows]
     # Successive periods of a sine are alike, those of random motion are not.
-    unlike = float(np.median([np.median(np.abs(np.diff(one) / one[1:])) if one.size > 2 else 1.0 for one in periods]))
+    unlike = np.median([np.median([*np.abs(np.diff(one) / one[1:]), 1.0]) for one in periods])
     if unlike < 0.05:
         longest = max(periods, key=len)
         ends = [np.median(part) for part in np.array_split(longest, min(longest.size, 8))]

@@ -105,7 +105,7 @@ def _segment(rows: Rows, form: Form, several: bool, path: Path) -> _Segment:
         (len(body) < number("Samples", first), f"{place}: {words}; export it again"),
         (dimension not in ("Time", "Frequency"), f"{place}: its x-values are {shown(dimension)}: time is needed"),
     )
-    step, x = number("Delta_X", first), table[:, first - 1 if several else 0]
+    step, x = number("Delta_X", first), table[:, (first - 1) * several]
     if dimension == "Frequency":
         x = number("X0", first) + step * np.arange(len(body))
     name, unit = {"Time": (_X, "s"), "Frequency": (dimension, "Hz")}[dimension]

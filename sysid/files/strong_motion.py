@@ -22,7 +22,7 @@ from sysid.structure.structure import Array
 
 _START = re.compile(r"\s*(\d+)\s+points of (accel|veloc|displ)\S* data equally spaced at\s*([\d.]+)\s*sec", re.I)
 _UNIT = re.compile(r"\bin\s+([a-z]\S*?)\.?(?:\s|$)|units?\s*[:=]\s*([^\s)]+)", re.IGNORECASE)
-_FORTRAN = re.compile(r"\(\s*(\d+)f(\d+)\.\d+\s*\)", re.IGNORECASE)
+_FORTRAN = re.compile(r"\(\s*\d+f(\d+)\.\d+\s*\)", re.IGNORECASE)
 _END = re.compile(r"end[- ]of[- ]data\s+for\s+chan", re.IGNORECASE)
 _CHANNEL = re.compile(r"^\s*chan(?:nel)?\s*(\d+)\s*:\s*(.*)", re.IGNORECASE)
 _FILTER = re.compile(r"filtered.* at\s*([\d.]+)\s*and\s*([\d.]+)\s*(?:cyc/sec|hz)", re.IGNORECASE)
@@ -66,20 +66,18 @@ def _channel(lines: Sequence[str], begin: int, end: int, number: int, path: Path
     if match is None or match[2].lower() != "accel":
         raise InputError(f"{path}, line {begin + 1}: channel {number} of the file has no accelerations")
     text = list(lines[begin : starts[0]])
-    named = next((found for found in map(_CHANNEL.match, text) if found), None)
-    words = " ".join(named[2].split()) if named else ""
-    name = f"Chan {int(named[1]) if named else number}"
+    named = next(filter(None, map(_CHANNEL.match, [*text, f"Chan {number}: "])))
+    name, words = f"Chan {int(named[1])}", " ".join(named[2].split())
     values = _values(lines, starts[0], [*starts, end][1], int(match[1]), path)
-    unit = _UNIT.search(lines[starts[0]])
+    unit = "".join("".join(pair) for pair in _UNIT.findall(lines[starts[0]])[:1])
     axis = {"up": "z", "down": "-z"}.get(words.partition(" ")[0].lower(), "")
-    column = Column(name, values, (unit[1] or unit[2]) if unit else "", f"{name} ({words})", axis=axis)
+    column = Column(name, values, unit, f"{name} ({words})", axis=axis)
     return _Channel(column, _interval(text, float(match[3])), text)
 
 
 def _values(lines: Sequence[str], start: int, end: int, count: int, path: Path) -> Array:
     """The numbers between two lines, in fields of the width that the first one states."""
-    form = _FORTRAN.search(lines[start])
-    width = int(form[2]) if form else 10
+    width = int(next(iter(_FORTRAN.findall(lines[start])), "10"))
     values: list[float] = []
     for at in range(start + 1, end):
         line = lines[at].rstrip()
@@ -108,8 +106,7 @@ def _remarks(found: Sequence[_Channel]) -> list[str]:
     text = found[0].text
     station = next((match[1] for match in map(_STATION.match, text) if match), "of no number")
     remarks = [f"station {station}: {', '.join(one.column.place for one in found)}"]
-    match = next((match for line in text if (match := _FILTER.search(line))), None)
-    if match:
-        band = f"{float(match[1]):g} to {float(match[2]):g} Hz"
-        remarks.append(f"the records were filtered to {band}: lines outside hold no motion of the structure")
-    return remarks
+    bands = [f"{float(low):g} to {float(high):g} Hz" for low, high in _FILTER.findall("\n".join(text))[:1]]
+    return remarks + [
+        f"the records were filtered to {one}: lines outside hold no motion of the structure" for one in bands
+    ]
