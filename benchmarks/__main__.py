@@ -11,7 +11,7 @@ from benchmarks.measure import run
 from benchmarks.registry import BENCHMARKS, names, select
 
 LIST_HEADER = ("group", "name", "what it measures", "full", "reduced")
-LIST_WIDTHS = (8, 21, 72, 7, 7)  # characters
+LIST_WIDTHS = (10, 21, 72, 7, 7)  # characters
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

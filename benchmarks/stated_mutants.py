@@ -80,7 +80,7 @@ MISSED = (
     Mutant("J12", "inertia that is not stated by the radius of gyration, not its square",
         "np.where(lever > 0, lever**2, 1.0)", "np.where(lever > 0, lever, 1.0)",
         "test_geometry::TestTotals"),
-    Mutant("J13", "sample rate rounded to three digits", 'near = float(f"{rate:.6g}")', 'near = float(f"{rate:.3g}")',
+    Mutant("J13", "sample rate rounded to three digits", 'or float(f"{rate:.6g}")', 'or float(f"{rate:.3g}")',
         "test_reading::test_the_rate_of_a_short_record_is_that_of_its_times"),
     Mutant("J15", "Gauss-Newton Hessian without that of the constraints",
         "hessian += ca.hessian(ca.dot(multipliers[:count], rows[:count]), at)[0]", "pass",

@@ -47,7 +47,9 @@ CEILINGS = {
     # expressions and residuals of the user's own (210),
     # damaged samples of records, found, left out or refused, and told (694),
     # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
-    "lines": 45_640,
+    # and files of LabVIEW, strong-motion records, runs of joined files and base sensors told apart (310),
+    # and the kind of test that a file seems to be, with what is missing (125),
+    "lines": 46_075,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

@@ -335,8 +335,8 @@ COMMANDS = {
     "run --resume out": "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there, and goes on with "
     "it where there is one",
     "run idle.py --resume out --fresh": "--resume and --fresh exclude each other",
-    "run shear_building --goal 0.1": "--mass, --lumped, --band, --goal and --gain-std are for a test that "
-    "'sysid read' wrote",
+    "run shear_building --goal 0.1": "--mass, --lumped, --band, --gain-std, --at-rest and --goal are for a "
+    "test that 'sysid read' wrote",
     "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
 }
 
@@ -641,6 +641,8 @@ def test_what_a_file_leaves_open_is_remarked(here):
     )
     said = {"base_axes": "x", "frf": "transmissibility", "frequency": "w", "convention": "exp(+iwt)"}
     assert reading.gather(Path("frf.npz"), said | {"sensor": [top | {"column": "h1"}]}).remarks == (
+        "frf.npz: 1 line within the half-power width of its sharpest peak, too few for its damping: export finer lines "
+        "(longer blocks)",
         "frf.npz: array 'w': frequencies have no unit, and are taken as Hz", "spectra follow exp(+iwt), as stated",
     )  # fmt: skip
 

@@ -17,10 +17,11 @@ import numpy as np
 
 import sysid
 from benchmarks.hostile.damage import KINDS, damaged
+from benchmarks.laboratory.written_files import Lvm, StrongMotion
 from benchmarks.line import Line, below
 from sysid.cli.main import main
 from sysid.cli.starting import BUG
-from sysid.files import xsens_dot
+from sysid.files import lvm, strong_motion, xsens_dot
 from sysid.jobs.job import Job, JobResult
 from sysid.jobs.submission import FILE_NAME as LEDGER
 from sysid.jobs.submission import Ledger
@@ -56,7 +57,9 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
     state = folder / "state.h5"
     sysid.identify(problem, strategy=sysid.Swarm(5), rng=0, callback=_stop, checkpoint=Checkpoint(state, every=0.0))
     unfinished = state.read_bytes()
-    file = folder / "fuzzed"
+    file, noise = folder / "fuzzed", np.random.default_rng(1).standard_normal((2, 40))
+    labview = Lvm(["table", "top"], ["g", "g"], [noise, -noise], gaps=[1.0], special="Packet_Notes")
+    volume = StrongMotion(["360 Deg", "Up"], noise)
 
     def of(sound: bytes, read: Callable[[], object], file: Path = file) -> Attempt:
         def attempt(rng: np.random.Generator) -> None:
@@ -74,6 +77,8 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
         "states of unfinished searches": of(unfinished, Checkpoint(file).read),
         "ledgers of jobs": of(_ledger(folder), lambda: _ledger(folder), folder / LEDGER),
         "CSV of inertial units": of(_xsens(), lambda: xsens_dot.read_xsens_dot(file)),
+        "measurement files of LabVIEW": of(labview.text().encode(), lambda: lvm.read_lvm(file)),
+        "strong-motion records": of(volume.text().encode(), lambda: strong_motion.read_strong_motion(file)),
         "the command line": _command,
     }
 

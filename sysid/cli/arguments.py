@@ -51,13 +51,15 @@ def command_parser() -> argparse.ArgumentParser:
     command("list", summary="list the problems that can be run by name", examples=("sysid list",))
     for add in (_add_new, _add_show, _add_read, _add_run, _add_compare, _add_refine, _add_report, _add_export):
         add(command)
-    command(
+    doctor = command(
         "doctor",
-        summary="tell what this installation has, what it lacks, and how to get that",
+        summary="tell what this installation has, or what a file of a logger holds, what it lacks, and how to get that",
         description="Tell versions of Python and packages, the solvers that work here, threads, and which extras are "
-        "installed, with the command for those that are not. Exit status 2 where a search could not work.",
-        examples=("sysid doctor", "sysid doctor --json"),
+        "installed, with the command for those that are not. Exit status 2 where a search could not work. Of files: "
+        "their channels, the kind of test that they seem to be, and what is still to be said.",
+        examples=("sysid doctor", "sysid doctor --json", "sysid doctor sine.csv"),
     )
+    doctor.add_argument("files", metavar="FILE", nargs="*", help="files of a logger, such as 'sysid read' takes")
     return parser
 
 
@@ -201,6 +203,10 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
         "--gain-std", type=float, metavar="SHARE",
         help="of TEST.h5: tolerance of the gains of all channels, base and force included, as a standard deviation, "
         "such as 0.005; those that the sensors' list states, exact where it states none",
+    )  # fmt: skip
+    run.add_argument(
+        "--at-rest", action="store_true", default=None,
+        help="of TEST.h5: all records begin and end at rest, or were tapered to it, and have no transients",
     )  # fmt: skip
 
 

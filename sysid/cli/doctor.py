@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -15,7 +16,11 @@ from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.starting import MISTAKE, SUCCESS
-from sysid.errors import how_to_install
+from sysid.errors import InputError, how_to_install
+from sysid.files.assembly import recorded_rate
+from sysid.files.description import asked
+from sysid.files.kind import channels_of, coarse_lines, kind_of
+from sysid.files.reading import gather, recordings_of
 from sysid.results.version import __version__
 
 _PACKAGE = "structural-sysid"
@@ -52,7 +57,9 @@ class Package:
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
-    """Tell all of it; a mistake where something is missing that every search needs."""
+    """Tell all of it; a mistake where something is missing that every search needs, or a file cannot be read."""
+    if options.files:
+        return _look(options.files, out)
     packages, solvers, threads = tuple(_packages()), linear_solvers(), _libraries()
     required = [package for package in packages if not package.extra]
     missing = sorted({package.extra for package in packages if package.extra and not package.enough})
@@ -81,6 +88,40 @@ def run(options: argparse.Namespace, out: Output) -> int:
         members = ", ".join(f"{one.name} {_version(one)}" for one in packages if one.extra == extra)
         out.write(f"  {extra:<10} {members}" + (f": {how_to_install(extra)}\n" if extra in missing else "\n"))
     return _judged(required, solvers, out)
+
+
+def _look(names: list[str], out: Output) -> int:
+    """Tell channels and kind of the runs of some files, and what `sysid read` still needs to be told."""
+    files = [Path(name) for name in names]
+    said, missing, runs = asked(None, files), list[str](), []
+    base = [str(channel.column) for channel in said.channels if channel.role == "base"]
+    for one in recordings_of(files, said):
+        kind, channels, rate = kind_of(one, base), channels_of(one), ""
+        if one.freq is None:
+            with _told(missing):
+                rate = f" at {recorded_rate(one, said):g} Hz"
+        out.write(
+            f"{one.path}: {one.columns[0].values.size} {'samples' if one.freq is None else 'lines'}{rate}, {kind}\n"
+        )
+        for column in channels:
+            out.write(f"  {column.name:<20} {column.unit or 'no unit':<10} {column.place}\n")
+        out.write("".join(f"  {remark}\n" for remark in one.remarks))
+        missing += coarse_lines(one)
+        runs.append({"file": str(one.path), "kind": kind, "channels": [column.name for column in channels]})
+    with _told(missing):
+        gather(files, said)
+    out.answer(runs=runs, missing=missing)
+    out.write("".join(f"missing: {one}\n" for one in dict.fromkeys(missing)) or "'sysid read' takes them as they are\n")
+    return SUCCESS
+
+
+@contextlib.contextmanager
+def _told(missing: list[str]) -> Iterator[None]:
+    """Add what is refused within to what is missing."""
+    try:
+        yield
+    except InputError as error:
+        missing.append(str(error))
 
 
 def _judged(required: list[Package], solvers: list[str], out: Output) -> int:

@@ -12,7 +12,7 @@ from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 
-from sysid.errors import InputError, shown
+from sysid.errors import InputError, refuse, shown
 from sysid.files.recording import Column, Recording, is_abscissa
 from sysid.files.tree import Allowance, check_all_links, check_data
 
@@ -123,24 +123,25 @@ def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording
     Raises
     ------
     InputError
-        Where there are no vectors, of the length that most have.
+        Where there are no vectors; a square matrix, which does not tell whether its channels are rows or columns.
     """
     numbers = {name: (np.squeeze(one), unit) for name, (one, unit) in named.items() if one.dtype.kind in "buifc"}
     scalars = {name: float(one) for name, (one, _) in numbers.items() if one.ndim == 0 and one.dtype.kind != "c"}
-    flat = {name: one.size for name, (one, _) in numbers.items() if one.ndim == 1}
-    along = {size for name, size in flat.items() if is_abscissa(name)} or set(flat.values())
+    lengths = {one.size for name, (one, _) in numbers.items() if one.ndim == 1 and is_abscissa(name)}
     vectors: dict[str, tuple[Any, str]] = {}
     remarks = []
     for name, (one, unit) in numbers.items():
         if one.size > 1:
-            lines = _lines(one, along)
+            lines = _lines(one, lengths)
             vectors |= {f"{name}[{at}]" if one.ndim > 1 else name: (line, unit) for at, line in enumerate(lines, 1)}
-            if one.ndim > 1 and lines.shape[1] not in along:
+            if one.ndim > 1 and lines.shape[1] not in lengths:
                 remarks.append(f"array {name!r} is taken as {len(lines)} records of {lines.shape[1]} samples")
     if not vectors:
         raise InputError(f"{path} holds no arrays of records: a vector of samples a channel is needed, or a matrix")
-    lengths = [size for name, size in flat.items() if is_abscissa(name)]
     length = max(lengths or [one.size for one, _ in vectors.values()])
+    square = next((name for name, (one, _) in numbers.items() if one.shape.count(length) > 1), None)
+    words = f"has {length} rows and as many columns: which of them are its channels? Save a vector for each channel"
+    refuse((square is not None, f"{path}: array {square!r} {words}"))
     other = [name for name, (one, _) in vectors.items() if one.size != length]
     remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
     rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)
@@ -150,9 +151,9 @@ def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording
     return [Recording(path, columns, rate, remarks=tuple(remarks))]
 
 
-def _lines(array: Any, along: set[int]) -> Any:
+def _lines(array: Any, lengths: set[int]) -> Any:
     """Records of an array, a row each: along a side that is as long as time or frequency, else the longest."""
-    sides = [side for side, size in enumerate(array.shape) if size in along] or range(array.ndim)
+    sides = [side for side, size in enumerate(array.shape) if size in lengths] or range(array.ndim)
     side = max(sides, key=lambda at: array.shape[at])
     return np.moveaxis(array, side, -1).reshape(-1, array.shape[side])
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,7 +41,7 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     axes = base_directions(said)
     runs, table, rates = [], [], []
     for recording in recordings:
-        rates.append(_rate(recording, said))
+        rates.append(recorded_rate(recording, said))
         records, rows = _records(recording, said)
         late = np.array([channel.delay for channel in said.channels])
         if np.any(late):
@@ -49,12 +51,13 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
         remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
         parts = list(zip(said.channels, records, strict=True))
         runs.append(run_of(parts, said, axes, str(recording.path)))
+        remarks += base_differences(parts, said, axes, str(recording.path))
     if max(rates) - min(rates) > 1e-6 * max(rates):
         raise InputError(
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
             f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
         )
-    remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0]))]
+    remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0])), *_rests(runs)]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks),
         **tolerances_of(said, axes),
@@ -65,6 +68,14 @@ def delays_in_words(said: Description) -> list[str]:
     """A remark on each channel whose delay is stated, and taken off."""
     late = [channel for channel in said.channels if channel.delay]
     return [f"{one.column} is {1e3 * one.delay:.6g} ms late as stated; that is taken off" for one in late]
+
+
+def _rests(runs: Sequence[Run]) -> list[str]:
+    """A remark where all records begin and end at rest: hardly move in their first and last samples, few of many."""
+    records = [row for run in runs for part in run if part is not None for row in part]
+    ends = [np.delete(row, slice(n, -n)) for row in records if (n := max(row.size // 500, 5))]
+    words = "the records begin and end at rest, or were tapered to it: 'sysid run --at-rest' takes them so"
+    return [words] * all(np.std(end) < 0.01 * np.std(row) for end, row in zip(ends, records, strict=True))
 
 
 def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
@@ -158,12 +169,12 @@ def base_directions(said: Description, channels_needed: bool = True) -> tuple[st
     return tuple(name for name in BASE_AXES if name in letters)
 
 
-def _rate(recording: Recording, said: Description) -> float:
+def recorded_rate(recording: Recording, said: Description) -> float:
     """Samples a second, Hz: by the column of time, else stated or of the file."""
     column = next(iter(_time_columns(recording, said)), None)
     if column is None:
         rate = said.sample_rate or recording.sample_rate
-        if rate is None:
+        if rate is None or not 0 < rate < np.inf:
             raise InputError(
                 f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in '
                 f"Hz (--time, --rate); {recording.in_words()}"
@@ -174,10 +185,10 @@ def _rate(recording: Recording, said: Description) -> float:
         raise InputError(f"{place}: time in {column.unit!r} is not understood: s, ms, us are")
     check_column(column, recording.path)
     rate = rate_of(np.real(column.values) * known.factor, recording.path, column.place)
-    stated = said.sample_rate or rate
-    words = f"time tells {rate:g} Hz and sample_rate {stated:g} Hz; is time in another unit than s? State one of them"
-    refuse((abs(rate / stated - 1) > 0.01, f"{place}: {words}"))
-    near = float(f"{rate:.6g}")  # without what rounding of the times in a file adds to it
+    stated, of = (said.sample_rate, "sample_rate") if said.sample_rate else (recording.sample_rate, "the file's rate")
+    near = stated or float(f"{rate:.6g}")  # without what rounding of the times in a file adds to it
+    words = f"time tells {rate:g} Hz and {of} {near:g} Hz; is time in another unit than s? State one of them"
+    refuse((abs(rate / near - 1) > 0.01, f"{place}: {words}"))
     return said.sample_rate or (near if abs(near / rate - 1) * column.values.size < 0.05 else rate)
 
 
@@ -254,6 +265,31 @@ def _base_motion(parts: Sequence[tuple[Channel, Any]], said: Description, axes: 
     return values if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ values
 
 
+def base_differences(
+    parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str
+) -> list[str]:
+    """Readings of more sensors of the base than it has directions, as shares of the motion that is taken for it.
+
+    Refused are such that have less than half in common.
+    """
+    base = [part for part in parts if part[0].role == "base"]
+    if len(base) <= len(axes):
+        return []
+    values = np.array([one for _, one in base])
+    taken = _motions(base, said, axes) @ _base_motion(base, said, axes, place)
+    sizes, off = (np.linalg.norm(one, axis=1) for one in (values, values - taken))
+    words = f"{place}: {len(base)} base sensors along {' '.join(axes)}"
+    apart = "share less than half of what they record: mend a sign (axis), a unit or a gain, or state how"
+    names = ", ".join(repr(one.name) for one, _ in base)
+    wrong = np.linalg.norm(off) > 0.5 * np.linalg.norm(sizes)
+    refuse((wrong, f'{words} ({names}) {apart} else the base moves, such as base_axes = "x rz"'))
+    gains = [float(np.real(np.vdot(b, a) / np.vdot(b, b))) for a, b in zip(values, taken, strict=True)]
+    each = zip(base, gains, off / sizes, strict=True)
+    read = ", ".join(f"{one.name!r} {gain:.4g} times (off by {100 * share:.2g} %)" for (one, _), gain, share in each)
+    words += f" read the motion that is taken for that of the base: {read}"
+    return [words]
+
+
 def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """The sum of the load cells along the base's directions, (d, n)."""
     cells = _motions(parts, said, axes)
@@ -283,18 +319,51 @@ def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
     return [right] * (share > _CLEAR_POWER) + [reversed_] * (share < -_CLEAR_POWER)
 
 
-def by_folder(recordings: Sequence[Recording], said: Description) -> list[Recording]:
-    """The recordings of each folder as one, in the order of the folders.
+def runs_of_files(files: Sequence[Path], said: Description) -> list[dict[Path, str]]:
+    """The files of each run with what they are called there, in the order of the files.
+
+    A folder is a run. Where the names of its files are more than those of the sensors, such as ``run2_top`` of ``top``,
+    files with the same rest are one.
+    """
+    columns = [one.column for one in said.channels if isinstance(one.column, str) and not one.column.isdecimal()]
+    known = {".".join(parts[:n]) for parts in (name.split(".") for name in columns) for n in range(1, len(parts) + 1)}
+    runs = []
+    for folder in dict.fromkeys(file.parent for file in files):
+        groups: dict[str, dict[Path, str]] = {}
+        whole = {file: file.stem for file in files if file.parent == folder}
+        for file in whole:
+            rests = {name: re.split(rf"(?:^|[-_. ]){re.escape(name)}(?:[-_. ]|$)", file.stem) for name in known}
+            if name := max((one for one in known if len(rests[one]) > 1), key=len, default=""):
+                groups.setdefault("|".join(rests[name]), {})[file] = name
+        # Names of sensors alone are a run, beside which other names are its further files, unless they are as complete.
+        complete = len({frozenset(one.values()) for one in groups.values()}) == 1 < len(groups)
+        runs += list(groups.values()) if groups and ("|" not in groups or complete) else [whole]
+    return runs
+
+
+def joined(recordings: Sequence[Recording], said: Description) -> list[Recording]:
+    """The recordings of the files of each run as one.
 
     A column is called by its file, or ``FILE.COLUMN`` where that has several beside time or frequency. Refused are
     files of other times or rates, or longer than others by more than a hundredth, unless their clocks are aligned.
     """
-    folders = dict.fromkeys(recording.path.parent for recording in recordings)
-    return [_together([one for one in recordings if one.path.parent == folder], said) for folder in folders]
+    runs, every = [], runs_of_files(list(dict.fromkeys(one.path for one in recordings)), said)
+    described = [part for one in said.channels for part in (str(one.column), str(one.column).partition(".")[0])]
+    for names in every:
+        lost = [one for other in every for one in other.values() if one in described and one not in names.values()]
+        words = f"its run has no file of {', '.join(map(repr, dict.fromkeys(lost)))}, as another has: name it too"
+        refuse((lost, f"{next(iter(names))}: {words}"))
+        held = [[one for one in recordings if one.path == file] for file in names]
+        counts = {len(one) for one in held}
+        words = "hold other numbers of runs, and are to be joined: write each run to files of its own"
+        refuse((len(counts) > 1, f"{', '.join(map(str, names))} {words}"))
+        runs += [_together(files, list(names.values()), said) for files in zip(*held, strict=True)]
+    return runs
 
 
-def _together(recordings: Sequence[Recording], said: Description) -> Recording:
-    first, parts = recordings[0], [_channels(recording, said) for recording in recordings]
+def _together(recordings: Sequence[Recording], names: Sequence[str], said: Description) -> Recording:
+    both = zip(recordings, names, strict=True)
+    first, parts = recordings[0], [_channels(recording, name, said) for recording, name in both]
     remarks = [f"{one.path.name}: {remark}" for one in recordings for remark in one.remarks]
     lengths = np.array([recording.columns[0].values.size for recording in recordings])
     if said.align:
@@ -307,15 +376,14 @@ def _together(recordings: Sequence[Recording], said: Description) -> Recording:
         cut = f"{max(lengths)} samples of the longest file are cut to the {min(lengths)} of the shortest"
         remarks += [cut] * bool(np.ptp(lengths))
     n = min(lengths - begins)
-    columns = [replace(one, values=one.values[:n]) for one in _abscissa(first, said)]
-    for begin, part in zip(begins, parts, strict=True):
-        columns += [replace(column, values=column.values[begin : begin + n]) for column in part]
+    columns = [one.part(0, n) for one in _abscissa(first, said)]
+    columns += [one.part(begin, begin + n) for begin, part in zip(begins, parts, strict=True) for one in part]
     return Recording(first.path, tuple(columns), first.sample_rate, first.freq, tuple(remarks))
 
 
-def _channels(recording: Recording, said: Description) -> list[Column]:
+def _channels(recording: Recording, stem: str, said: Description) -> list[Column]:
     """The columns of a file beside time or frequency, called as they are in the run."""
-    shared, stem = [id(column) for column in _abscissa(recording, said)], recording.path.stem
+    shared = [id(column) for column in _abscissa(recording, said)]
     others = [column for column in recording.columns if id(column) not in shared]
     named = [stem if len(others) == 1 else f"{stem}.{column.name}" for column in others]
     places = [f"{column.place} of {recording.path.name}" for column in others]
@@ -331,7 +399,7 @@ def _begins(
     """
     clocks = []
     for recording, part in zip(recordings, parts, strict=True):
-        rate = _rate(recording, said)  # refuses a time of another unit
+        rate = recorded_rate(recording, said)  # refuses a time of another unit
         begin = sum(
             units.unit(one.unit or "s", one.place).factor * one.values[0] for one in _time_columns(recording, said)
         )

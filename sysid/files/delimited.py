@@ -24,13 +24,14 @@ _CLOCK = re.compile(r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]\s*)?(\d{1,2}):(\d{2
 
 
 @dataclass(frozen=True)
-class _Form:
+class Form:
     """Form of the numbers in a line."""
 
     delimiter: str
     comma: bool  # decimal comma
 
     def fields(self, line: str) -> list[str]:
+        """The fields of a line, without blanks and quotes around them."""
         parts = _BLANKS.split(line.strip()) if self.delimiter == " " else line.split(self.delimiter)
         return [part.strip().strip('"').strip() for part in parts]
 
@@ -61,7 +62,7 @@ def read_delimited(path: Path) -> list[Recording]:
 
     Refused is a file without a table, a line in the middle with another number of fields or a word, a second table.
     """
-    lines = _text(path).splitlines()
+    lines = text_of(path).splitlines()
     form, width = _form(lines, path)
     rows = [(number, form.fields(line)) for number, line in enumerate(lines, 1) if line.strip(" \t\r\x1a\0")]
     first = next(
@@ -71,18 +72,20 @@ def read_delimited(path: Path) -> list[Recording]:
     number, last = body[-1]
     if len(body) > 1 and (len(last) < width or form.numbers(last) is None):
         body, remarks = body[:-1], [f"line {number}, the last, is cut short and left out"]
-    table = _numbers(body, form, width, path)
+    table = table_of(body, form, width, path)
     values = [column if np.any(column.imag) else column.real for column in table.T]
     names, given = _header([row for _, row in rows[:first]], width)
     kept = [at for at in range(width) if not (names[at] == "" and np.all(np.isnan(values[at])))]
+    places = [f"column {at + 1} ({name or 'no name'})" for at, name in enumerate(names)]
+    lines_of = np.array([number for number, _ in body])
     columns = tuple(
-        Column(names[at] or f"column {at + 1}", values[at], given[at], f"column {at + 1} ({names[at] or 'no name'})")
-        for at in kept
+        Column(names[at] or f"column {at + 1}", values[at], given[at], places[at], lines=lines_of) for at in kept
     )
     return [Recording(path, columns, remarks=tuple(remarks))]
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """The text of a file in any usual encoding; an empty one is refused."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -101,7 +104,7 @@ def _text(path: Path) -> str:
         return content.decode("latin-1")
 
 
-def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[_Form, int]:
+def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[Form, int]:
     """Delimiter, decimal sign and number of fields by which most of some lines from the middle on are numbers."""
     filled = [line for line in lines if line.strip()]
     middle = filled[len(filled) // 3 :][:looked_at]
@@ -109,7 +112,7 @@ def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[_Form, in
     for delimiter, comma in product(";\t,| ", (False, True)):
         if comma and delimiter == ",":
             continue
-        form = _Form(delimiter, comma)
+        form = Form(delimiter, comma)
         rows = [form.fields(line) for line in middle]
         widths = Counter(len(row) for row in rows if form.numbers(row) is not None and any(row))
         if widths:
@@ -123,7 +126,8 @@ def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[_Form, in
     return best
 
 
-def _numbers(body: list[tuple[int, list[str]]], form: _Form, width: int, path: Path) -> Array:
+def table_of(body: list[tuple[int, list[str]]], form: Form, width: int, path: Path) -> Array:
+    """The numbers of rows with the numbers of their lines, (rows, width); the first that is none is refused."""
     table = []
     for number, row in body:
         values = form.numbers(row) if len(row) == width else None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sysid.errors import InputError, path_of, refuse
-from sysid.files import arrays, assembly, delimited, responses, universal, xsens_dot
+from sysid.files import arrays, assembly, delimited, lvm, responses, strong_motion, universal, xsens_dot
 from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
 from sysid.files.recording import Recording, recognised
@@ -17,6 +18,8 @@ _TEXT = (".csv", ".txt", ".tsv", ".asc", ".dat")
 _UNIVERSAL = (".uff", ".unv", ".ufb")
 _READERS: dict[str, Callable[[Path], list[Recording]]] = {
     **dict.fromkeys(_TEXT, delimited.read_delimited),
+    ".lvm": lvm.read_lvm,
+    ".v2": strong_motion.read_strong_motion,
     ".npz": arrays.read_npz,
     ".mat": arrays.read_mat,
     **dict.fromkeys((".h5", ".hdf5"), arrays.read_hdf5),
@@ -34,8 +37,9 @@ def read(
     Parameters
     ----------
     paths : path or sequence of paths
-        CSV and other text tables, MATLAB files, universal files with sets 58 or 58b, HDF5, NPZ; each file is a run,
-        unless `sensors` has ``join = true``: then the files of a folder are.
+        CSV and other text tables, LabVIEW measurement files, MATLAB files, universal files with sets 58 or 58b, HDF5,
+        NPZ, corrected strong-motion records (.V2); each file is a run, unless `sensors` has ``join = true``: then the
+        files of a folder are, or those of a folder whose names differ by those of the sensors alone.
     sensors : path or mapping, optional
         Which column is which sensor: a TOML file, or the same as dictionaries and lists. By default the TOML file
         beside the first file: of its name, or ``sensors.toml``.
@@ -68,21 +72,26 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     """The test of some files, with its records whole; arguments as of `read`."""
     files = [path_of("paths", path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     refuse((not files, "paths is empty: give the files of a test"))
-    for file in files:
-        _check_file(file)
     said = asked(sensors, files)
-    if all(xsens_dot.is_export(file) for file in files):
-        return assembly.assembled_in_time([xsens_dot.together(files, said)], said)  # a unit is a file
-    recordings = [recording for file in files for recording in _read_any(file)]
-    if said.join:
-        recordings = assembly.by_folder(recordings, said)
-    else:
-        refuse((said.align, f"{said.place}: align goes with join: a file of its own is on one clock"))
-        _check_one_each(recordings, said)
-    recordings = [recognised(recording, said) for recording in recordings]
+    recordings = recordings_of(files, said)
     spectra = {recording.freq is not None for recording in recordings}
     refuse((len(spectra) > 1, "some files hold records in time and some spectra: read them apart"))
     return responses.from_spectra(recordings, said) if spectra.pop() else assembly.assembled_in_time(recordings, said)
+
+
+def recordings_of(files: Sequence[Path], said: Description) -> list[Recording]:
+    """The runs of some files, as far as they can be told without knowing which column is which sensor."""
+    for file in files:
+        _check_file(file)
+    if all(xsens_dot.is_export(file) for file in files):
+        return xsens_dot.together(files, said)  # a unit is a file
+    recordings = [recording for file in files for recording in _read_any(file)]
+    if said.join:
+        recordings = assembly.joined(recordings, said)
+    else:
+        refuse((said.align, f"{said.place}: align goes with join: a file of its own is on one clock"))
+        _check_one_each(recordings, said)
+    return [recognised(recording, said) for recording in recordings]
 
 
 def _check_file(file: Path) -> None:
@@ -96,20 +105,24 @@ def _check_file(file: Path) -> None:
     words = (
         f"{size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, .h5 or .npz,"
     )
-    long = file.suffix.lower() in _TEXT and size > 2**30
+    long = file.suffix.lower() in (*_TEXT, ".lvm", ".v2") and size > 2**30
     refuse((long, f"{file} has {words} or fewer channels or minutes a file"))
 
 
 def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
     """Refuse files that seem to hold one sensor each, where they are read as a run each."""
     names = set(recordings[0].names)
-    others = {name: other.path for other in recordings[1:] for name in (*other.names, other.path.stem)}
+    held = [(name, one.path) for one in recordings[1:] for name in (*one.names, one.path.stem)]
     elsewhere = [str(channel.column) for channel in said.channels if str(channel.column) not in names]
-    found = next((name for name in elsewhere if name in others), None)
-    words = (
-        f"no column {found!r}, which {others.get(str(found))} is or has: does each file hold one sensor? Then read them"
-    )
-    refuse((found is not None, f"{recordings[0].path} has {words} with --join (join = true)"))
+    found = [
+        (one, path)
+        for one in elsewhere
+        for name, path in held
+        if one.partition(".")[0] in (name, *re.split("[-_ ]", name))
+    ]
+    lost, path = next(iter(found), ("", None))
+    words = f"no column {lost!r}, which {path} is or has: does each file hold one sensor? Then read them"
+    refuse((found, f"{recordings[0].path} has {words} with --join (join = true)"))
 
 
 def _read_any(file: Path) -> list[Recording]:

@@ -16,7 +16,7 @@ from sysid.files import units
 from sysid.files.description import Description
 from sysid.structure.structure import Array
 
-_TIMES = ("time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time")
+_TIMES = ("time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time", "x_value")
 _FREQUENCIES = (
     "freq", "frequency", "frequencies", "freq_hz", "f_hz", "frequenz", "fréquence", "frequence", "frecuencia",
     "frequenza",
@@ -51,6 +51,8 @@ class Column:
         m, where the file holds the geometry.
     axis : str
         Where the file states it.
+    lines : (n,) or None
+        Lines of the file that hold the values, where it is a table of text.
     """
 
     name: str
@@ -60,6 +62,12 @@ class Column:
     reference: str = ""
     position: tuple[float, float, float] | None = None
     axis: str = ""
+    lines: NDArray[np.intp] | None = None
+
+    def part(self, begin: int, end: int) -> Column:
+        """The column with some of its values."""
+        lines = None if self.lines is None else self.lines[begin:end]
+        return replace(self, values=self.values[begin:end], lines=lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +118,8 @@ def check_column(column: Column, path: Path) -> None:
     """Refuse a column with a number that is NaN or infinite, with its place."""
     bad = np.flatnonzero(~np.isfinite(column.values))
     if bad.size:
-        words = f"sample {bad[0] + 1} of {column.values.size} is {column.values[bad[0]]} ({bad.size} such)"
+        line = "" if column.lines is None else f" (line {column.lines[bad[0]]})"
+        words = f"sample {bad[0] + 1} of {column.values.size}{line} is {column.values[bad[0]]} ({bad.size} such)"
         raise InputError(f"{path}, {column.place}: {words}: cut the record there, or leave this sensor out")
 
 

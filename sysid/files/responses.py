@@ -15,6 +15,7 @@ import numpy as np
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
 from sysid.files.assembly import (
+    base_differences,
     base_directions,
     delays_in_words,
     described,
@@ -25,6 +26,7 @@ from sysid.files.assembly import (
     work_of_force,
 )
 from sysid.files.description import CONVENTIONS, Channel, Description
+from sysid.files.kind import coarse_lines
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column
 from sysid.structure.structure import Array, ComplexArray
@@ -68,6 +70,7 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
         runs, table = _runs(recordings, said, axes, freq, conjugated=True)
     kept = freq > 0
     freq, runs = freq[kept], [_at(run, kept) for run in runs]
+    remarks = [few for one in recordings for few in coarse_lines(one) if said.frf != "spectrum"] + remarks
     remarks += ["the line at 0 Hz is left out"] * (not np.all(kept))
     remarks += [*delays_in_words(said), *work_of_force(runs, freq), how]
     return RecordedTest(
@@ -127,6 +130,7 @@ def _run(
     _check_responses(parts, said, reference, recording)
     has_base = any(channel.role == "base" for channel, _ in parts)
     moved = None if has_base else _unit_motion(lower, reference, axes, recording, freq)
+    base_differences(parts, said, axes, str(recording.path))  # refuses
     return run_of(parts, said, axes, str(recording.path), moved), rows
 
 
@@ -186,7 +190,7 @@ def _form(recording: Recording, column: Column, channel: Channel, said: Descript
     if not text and said.frf == "transmissibility" and channel.role != "force":
         return _Form(1 / channel.gain, "", "", "1")
     unsaid = f"no unit{' and no form' * (said.frf == '')} is stated: is it receptance, mobility, accelerance or"
-    state = 'State frf = "..." (--frf) and unit = "m/s² / N" or the like'
+    state = 'State unit = "g/g", "m/s² / N" or the like, or frf = "transmissibility" (--frf) of plain numbers'
     refuse((not text, f"{place}: of this function {unsaid} transmissibility? {state}"))
     upper, lower = units.ratio(text, place)
     form = _Form(upper.factor / lower.factor / channel.gain, upper.quantity, lower.quantity, text)

@@ -45,9 +45,9 @@ UNITS: dict[str, Unit] = {
     "rad/s": Unit("frequency", 1 / (2 * 3.141592653589793)),
 }
 _OTHER_WORDS = {
-    "m/s/s": "m/s2", "mm/s/s": "mm/s2", "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N", "sec": "s",
+    "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N", "newtons": "N",
     "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
-    "seconds": "s", "second": "s", "hz": "Hz", "kn": "kN", "n": "N", "G": "g", "g's": "g",
+    "hz": "Hz", "kn": "kN", "n": "N", "G": "g", "g's": "g",
 }  # fmt: skip
 
 
@@ -56,7 +56,8 @@ def find(text: str) -> Unit | None:
     plain = text.strip().replace("²", "2").replace("µ", "u").replace("μ", "u").replace("°", "deg")
     for sign in (" ", "^", "*", "·"):
         plain = plain.replace(sign, "")
-    plain = plain.replace("sec2", "s2").replace("(", "").replace(")", "")
+    plain = re.sub("sec(onds?)?", "s", plain.replace("(", "").replace(")", ""), flags=re.IGNORECASE)
+    plain = plain.replace("/s/s", "/s2")
     return UNITS.get(_OTHER_WORDS.get(plain, plain)) or UNITS.get(_OTHER_WORDS.get(plain.lower(), plain.lower()))
 
 

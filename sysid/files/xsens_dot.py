@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid.errors import InputError, refuse
 from sysid.files.alignment import UnitColumns, clock_moves
+from sysid.files.assembly import runs_of_files
 from sysid.files.description import Description
 from sysid.files.recording import Column, Recording
 from sysid.measurement.spectra import resample
@@ -79,8 +80,9 @@ def read_xsens_dot(path: str | Path) -> UnitRecord:
     time = pick((_TIME,))[0] * 1e-6
     acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))
     falls = np.diff(time) <= 0
+    bad = np.flatnonzero(~np.all(np.isfinite([time, *acceleration, *rotation]), axis=0))
     refuse(
-        (not np.all(np.isfinite([time, *acceleration, *rotation])), f"{file} holds NaN or infinite samples"),
+        (bad.size, f"{file} holds NaN or infinite samples at row {[*bad, 0][0] + 2} ({bad.size} such)"),
         (np.any(falls), f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}"),
     )
     return UnitRecord(time, acceleration, rotation)
@@ -95,27 +97,45 @@ def is_export(path: Path) -> bool:
         return False
 
 
-def together(paths: Sequence[Path], said: Description) -> Recording:
-    """The units of one run, a file each, on one clock: columns such as ``ground.Acc_X``, without their means."""
-    records = [read_xsens_dot(path) for path in paths]
+def together(paths: Sequence[Path], said: Description) -> list[Recording]:
+    """The units of each run, a file each, on one clock: columns such as ``ground.Acc_X``, without their means.
+
+    Files of one name are of several runs; those of runs at nearly one rate come at the slowest.
+    """
+    again = len({path.stem for path in paths}) < len(paths)
+    runs = runs_of_files(paths, said) if again else [{path: path.stem for path in paths}]
+    units = [{path: read_xsens_dot(path) for path in run} for run in runs]
+    rates = [min(one.sample_rate for one in run.values()) for run in units]
+    rate = min(rates) if max(rates) < 1.01 * min(rates) else None
+    return [_on_one_clock(named, list(run.values()), rate, said) for named, run in zip(runs, units, strict=True)]
+
+
+def _on_one_clock(
+    named: Mapping[Path, str], records: Sequence[UnitRecord], rate: float | None, said: Description
+) -> Recording:
+    """The units of a run at a rate, that of the slowest unless given."""
+    paths, names = list(named), list(named.values())
     times, moved = [record.time for record in records], list[str]()
     if said.align:
-        parts = zip(paths, records, strict=True)
-        units = [UnitColumns(p.name, one.time[0], one.sample_rate, _columns(p, one.acceleration)) for p, one in parts]
+        parts = zip(named.items(), records, strict=True)
+        units = [
+            UnitColumns(path.name, one.time[0], one.sample_rate, _columns(name, one.acceleration))
+            for (path, name), one in parts
+        ]
         offsets, moved = clock_moves(units, said)
         times = [time + offset for time, offset in zip(times, offsets, strict=True)]
     apart = max(time[0] for time in times) >= min(time[-1] for time in times)
     remedy = "" if said.align else ": units on clocks of their own are brought to one with --align (align = true)"
-    refuse((apart, f"{', '.join(path.name for path in paths)} have no time in common{remedy}"))
-    time, found = resample([(own, record.acceleration) for own, record in zip(times, records, strict=True)])
-    columns = tuple(one for path, unit in zip(paths, found, strict=True) for one in _columns(path, unit))
+    refuse((apart, f"{', '.join(map(str, paths))} have no time in common{remedy}"))
+    time, found = resample([(own, record.acceleration) for own, record in zip(times, records, strict=True)], rate)
+    columns = tuple(one for name, unit in zip(names, found, strict=True) for one in _columns(name, unit))
     remark = f"{len(paths)} units are brought to one clock; gravity and offsets are taken off: the mean of each channel"
-    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=(*moved, remark))
+    return Recording(paths[0], columns, rate or float(1 / (time[1] - time[0])), remarks=(*moved, remark))
 
 
-def _columns(path: Path, acceleration: Array) -> list[Column]:
+def _columns(unit: str, acceleration: Array) -> list[Column]:
     """The channels of a unit without their means."""
     return [
-        Column(f"{path.stem}.{name}", values - values.mean(), "m/s²", f"{path.stem}.{name}")
+        Column(f"{unit}.{name}", values - values.mean(), "m/s²", f"{unit}.{name}")
         for name, values in zip(_ACCELERATION, acceleration, strict=True)
     ]
