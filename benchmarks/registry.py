@@ -225,6 +225,9 @@ BENCHMARKS = (
         "channels.signed_exports", "exported files of a sensor at -x: sign in the row's name, or turned", "5 s", "3 s"
     ),
     Benchmark("channels.damaged", "damaged samples: kind and channel told; nothing of sound tests", "6 min", "20 s"),
+    Benchmark(
+        "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "15 min", "2 min"
+    ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 
