@@ -47,8 +47,8 @@ CEILINGS = {
     # expressions and residuals of the user's own (210),
     # damaged samples of records, found, left out or refused, and told (694),
     # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
-    # and least squares of whole records that no modes explain, and levels that quiet lines bound (115),
-    "lines": 45_680,
+    # and least squares of whole records that no modes explain, and levels that quiet lines bound (130),
+    "lines": 45_700,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

@@ -48,7 +48,13 @@ from sysid.modal_analysis.residual_tests import (
 )
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import real_times
-from sysid.modal_analysis.rough_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
+from sysid.modal_analysis.rough_poles import (
+    at_few_lines,
+    at_sines_alone,
+    decimated_lines,
+    rough_deviations,
+    steady_sine,
+)
 from sysid.modal_analysis.spectra_modes import strongest_poles
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
@@ -94,10 +100,12 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
 
     What a model misses passes for noise of the base, by which the modes then explain anything. Least squares go on from
     the modes found, with the motion of the base as recorded; where these are worse than a rigid body, from poles that
-    are looked for anew. Runs stated to be at rest that were not are a mistake, which explains what is missed.
+    are looked for anew. Runs stated to be at rest that were not are a mistake, which explains what is missed. Where the
+    base moves at few lines, as in a sine, squares would be those of these lines alone.
     """
     left, whole = left_of(fit), fit.model.whole
-    if fit.stopped or whole.noise is not None or left < much or not uneven(fit, 2 * fit.chi2 / fit.model.numbers):
+    sound = fit.stopped or whole.noise is not None or left < much or at_few_lines(fit.test)
+    if sound or not uneven(fit, 2 * fit.chi2 / fit.model.numbers):
         return fit
     monitor.doing = "least squares"
     plain = replace(fit, test=replace(fit.test, whole=replace(whole, varying=None, plain=True)))

@@ -14,6 +14,7 @@ from sysid.modal_analysis.fit import left_of, whole_fit
 from sysid.modal_analysis.noise_levels import bounded_by_lines
 from sysid.modal_analysis.record_fit import RecordFit, record_modes
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.rough_poles import at_few_lines
 
 LOADED = 5  # a bridge under vehicles: noise of the base explained twice a rigid body's residual
 
@@ -35,7 +36,7 @@ def test_a_load_that_nobody_recorded_leaves_no_more_than_spectra_and_a_rigid_bod
 
 
 def test_noise_is_at_most_what_the_quietest_lines_hold(loaded: sysid.Identification) -> None:
-    """The mean of 16 squares of white noise is below 0.70 of its own in a tenth of all cases; a tenth of the level is chance."""
+    """The mean of 16 squares of white noise is below 0.70 in a tenth of all cases; a tenth of a level is chance."""
     fit, test = loaded.modal[0].record_fit, Case.of(LOADED).test()
     assert fit is not None and loaded.noise is not None
     density = fit.model.whole.density[0]
@@ -84,6 +85,15 @@ def test_sound_records_keep_the_noise_of_all_channels() -> None:
 
 def test_runs_that_were_not_at_rest_are_a_mistake_of_its_own() -> None:
     assert not whole_fit(sound(at_rest=True)).model.whole.plain
+
+
+@pytest.mark.parametrize(("sine", "few"), [(0.0, False), (1.0, False), (2.0, True)])
+def test_a_base_moves_at_few_lines_where_a_sine_holds_most_of_its_power(sine: float, few: bool) -> None:
+    """Beside random motion of 1 m/s² rms, a sine whose power is a half of its squared amplitude."""
+    rng, t = np.random.default_rng(7), np.arange(4000) / 50.0
+    base = rng.standard_normal((1, t.size)) + sine * np.sin(2 * np.pi * 3.01 * t)
+    test = sysid.Measurement.from_time([(base, base, None)], 50.0, rigid_body=[[1.0]], band=(0.1, 25.0))
+    assert at_few_lines(test) == few
 
 
 def test_levels_are_cut_where_they_are_above_white_noise_of_the_quietest_lines() -> None:
