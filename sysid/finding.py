@@ -19,9 +19,9 @@ Kind = Literal[
     "clipped", "dropout", "held value", "spikes", "tone", "equal channels",
     # What speaks against a fit.
     "stopped", "bounds", "changing", "stated mass", "known entries", "lumped total", "constraint", "goal", "residual",
-    "beyond noise", "unpredicted", "changes not judged", "stated masses", "stated values", "stated value", "in motion",
-    "one mode twice", "coarse lines", "misfit", "force misfit", "rigid motion", "damping", "one motion", "own term",
-    "no solution",
+    "beyond noise", "least squares", "unpredicted", "changes not judged", "stated masses", "stated values",
+    "stated value", "in motion", "one mode twice", "coarse lines", "misfit", "force misfit", "rigid motion", "damping",
+    "one motion", "own term", "no solution",
     # What leaves the matrices open.
     "not judged", "other answers", "open", "noise", "modes not all tried",
     # What is to be known besides.

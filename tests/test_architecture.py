@@ -49,7 +49,8 @@ CEILINGS = {
     # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
     # and files of LabVIEW, strong-motion records, runs of joined files and base sensors told apart (310),
     # and the kind of test that a file seems to be, with what is missing (125),
-    "lines": 46_075,
+    # and least squares of whole records that no modes explain, and levels that quiet lines bound (130),
+    "lines": 46_230,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

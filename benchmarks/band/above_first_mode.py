@@ -28,7 +28,7 @@ LEAST = 2  # modes in them
 def lines(reduced: bool) -> Iterator[Line]:
     """Twenty tests; or two."""
     numbers = list(SHORT if reduced else islice((k for k in count() if cut(k)), TESTS))
-    answers = figures_of_each("above_first_mode", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    answers = figures_of_each("band.above_first_mode", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     found = {structure(k).name: it for k, it in zip(numbers, answers, strict=True)}
     what = f"{len(found)} tests whose lines begin above the first or second mode: "
     for text, of in (

@@ -31,7 +31,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     """60 structures, one draw each; or three, with little patience."""
     numbers = SHORT if reduced else range(STRUCTURES)
     truths, count = [structure(number) for number in numbers], len(numbers)
-    answers = figures_of_each("one_structure", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    answers = figures_of_each("band.one_structure", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     cases = [(truth, bound(truth, draw(truth)), it) for truth, it in zip(truths, answers, strict=True)]
     what = f"{count} continuous structures: "
     known = [case for case in cases if case[1].of_mass < KNOWN]

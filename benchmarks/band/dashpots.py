@@ -26,7 +26,9 @@ KINDS = {"dashpot": "with a dashpot", "classical": "without"}
 def lines(reduced: bool) -> Iterator[Line]:
     """20 structures with a dashpot and the same without, some draws each; or three, one draw each."""
     numbers, draws = (SHORT, 1) if reduced else (range(STRUCTURES), DRAWS)
-    cases = figures_of_each("dashpots", [DRAWN * draws + it for it in numbers], SHORT_PATIENCE if reduced else PATIENCE)
+    cases = figures_of_each(
+        "band.dashpots", [DRAWN * draws + it for it in numbers], SHORT_PATIENCE if reduced else PATIENCE
+    )
     said = [f"{number}: {it['said'][:80]}" for number, it in zip(numbers, cases, strict=True) if "said" in it]
     yield below(f"{len(cases)} structures, {draws} draws each: without a result {'; '.join(said)}", len(said), 0)
     for kind, name in KINDS.items():

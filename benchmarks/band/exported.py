@@ -78,7 +78,7 @@ class Superelement(NamedTuple):
 def lines(reduced: bool) -> Iterator[Line]:
     """Twelve structures; or one."""
     numbers = list(SHORT if reduced else range(STRUCTURES))
-    found = figures_of_each("exported", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    found = figures_of_each("band.exported", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     what = f"exported answers of {len(found)} continuous structures: "
     said = [f"{number}: {it['said'][:100]}" for number, it in zip(numbers, found, strict=True) if "said" in it]
     yield below(what + "without a result" + f" ({'; '.join(said)})" * bool(said), len(said), 0)

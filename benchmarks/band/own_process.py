@@ -16,7 +16,7 @@ SLOWER = 10  # by the clock, at most, on a machine with other work
 
 
 def figures_of_each(module: str, numbers: Iterable[int], patience: int) -> list[dict]:
-    """Figures that a module of this folder answers by `answer` to each number; why there are none, as "said".
+    """Figures that a module ("band.dashpots") answers by `answer` to each number; why there are none, as "said".
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def figures_of_each(module: str, numbers: Iterable[int], patience: int) -> list[
     """
 
     def figures(number: int) -> dict:
-        found = figures_of(f"benchmarks.band.{module}", [str(number), str(patience)], SLOWER * patience)
+        found = figures_of(f"benchmarks.{module}", [str(number), str(patience)], SLOWER * patience)
         if found.get("said") == "no output":  # as of a process that its system ended
             return {"said": f"not done after {patience} s of processor time"}
         return found

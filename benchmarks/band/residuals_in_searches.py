@@ -51,7 +51,7 @@ TO_NOISE = 1.1  # chi² over its degrees of freedom
 def lines(reduced: bool) -> Iterator[Line]:
     """Twenty structures by both searches; or two."""
     numbers = SHORT if reduced else range(STRUCTURES)
-    answers = figures_of_each("residuals_in_searches", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    answers = figures_of_each("band.residuals_in_searches", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     for name in STRATEGIES:
         found = [it.get(name, {"chi2": np.inf, "far": np.inf}) for it in answers]
         good = [it["chi2"] <= TO_NOISE and it["far"] <= FAR for it in found]

@@ -43,7 +43,7 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 def lines(reduced: bool) -> Iterator[Line]:
     """Five dummies to 200 Hz; or one to 100 Hz."""
     numbers = list(SHORT if reduced else DUMMIES)
-    found = figures_of_each("spacecraft_dummy", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    found = figures_of_each("band.spacecraft_dummy", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     high = dummy(numbers[0]).lines[1]
     what = (
         f"{len(found)} spacecraft dummies, 14 sensors, six base directions, to {high:g} Hz, {100 * NOISE:g} % noise: "

@@ -29,7 +29,7 @@ MOVING = 0.3  # of the largest motion with the base: what moves less tells littl
 def lines(reduced: bool) -> Iterator[Line]:
     """A hundred tests; or three."""
     numbers = list(SHORT if reduced else range(TESTS))
-    found = figures_of_each("wrong_sensors", numbers, SHORT_PATIENCE if reduced else PATIENCE)
+    found = figures_of_each("band.wrong_sensors", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     named = [it.get("named", False) for it in found]
     missed = Counter(MISTAKES[k % len(MISTAKES)] for k, right in zip(numbers, named, strict=True) if not right)
     tally = ", ".join(f"{kind} {times}" for kind, times in missed.items())

@@ -86,7 +86,8 @@ class WholeRecords:
     and end `at_rest` have no such numbers. Lines are multiples of ``sample_rate / N``, Hz. `noise` is stated, or None
     where it is estimated with the fit. `varying`, (runs, channels), are sensors, forces and base directions whose level
     is found to vary over the lines; `taken`, (n_sensors [+ 1],), s, are delays that were taken off sensors and force:
-    at one of its ends such a record holds what is not its own. Both are set by the fit, in no file.
+    at one of its ends such a record holds what is not its own. `plain` tells that squares are fitted, the base's motion
+    as recorded. All three are set by the fit, in no file.
     """
 
     samples: tuple[int, ...]
@@ -95,6 +96,7 @@ class WholeRecords:
     noise: NoiseLevels | None = field(default=None)
     varying: NDArray[np.bool_] | None = field(default=None)
     taken: Array | None = field(default=None)
+    plain: bool = field(default=False)
 
     @property
     def moving(self) -> tuple[int, ...]:

@@ -41,11 +41,21 @@ from sysid.modal_analysis.residual_tests import (
     gain_errors_of,
     runs_in_motion,
     scatter,
+    uneven,
     unidentifiable_levels,
     varying_levels,
     with_varying_levels,
 )
-from sysid.modal_analysis.rough_poles import at_sines_alone, decimated_lines, rough_deviations, steady_sine
+from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.response import real_times
+from sysid.modal_analysis.rough_poles import (
+    at_few_lines,
+    at_sines_alone,
+    decimated_lines,
+    rough_deviations,
+    steady_sine,
+)
+from sysid.modal_analysis.spectra_modes import strongest_poles
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
@@ -64,7 +74,11 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
     Stop, KeyboardInterrupt
         Where the monitor stops it before there was a fit.
     """
-    fit = _whole_fit if delays is None else functools.partial(_on_one_clock, delays=delays)
+    of_noise = _whole_fit if delays is None else functools.partial(_on_one_clock, delays=delays)
+
+    def fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+        return _no_worse_than_squares(of_noise(test, monitor=monitor), monitor)
+
     if monitor is None:
         return fit(test, monitor=FitMonitor())
     try:
@@ -79,6 +93,50 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
         test = without_delays(test, best.model.whole.taken)
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
+
+
+def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.1, worse: float = 1.01) -> RecordFit:
+    """The fit; where its model misses much of the records, and more than least squares of them do, these.
+
+    What a model misses passes for noise of the base, by which the modes then explain anything. Least squares go on from
+    the modes found, with the motion of the base as recorded; where these are worse than a rigid body, from poles that
+    are looked for anew. Runs stated to be at rest that were not are a mistake, which explains what is missed. Where the
+    base moves at few lines, as in a sine, squares would be those of these lines alone.
+    """
+    left, whole = left_of(fit), fit.model.whole
+    sound = fit.stopped or whole.noise is not None or left < much or at_few_lines(fit.test)
+    if sound or not uneven(fit, 2 * fit.chi2 / fit.model.numbers):
+        return fit
+    monitor.doing = "least squares"
+    plain = replace(fit, test=replace(fit.test, whole=replace(whole, varying=None, plain=True)))
+    try:
+        squares = refitted(plain, fit.parameters, monitor=monitor)
+        if left > 1.0:
+            squares = min((squares, *_anew(plain, monitor)), key=left_of)
+    except (Stop, KeyboardInterrupt):
+        return replace(fit, stopped=True)
+    return squares if left > worse * left_of(squares) and not runs_in_motion(fit) else fit
+
+
+def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
+    """The fit of as many modes at most, at those poles that the records need most; none where none stand out."""
+    try:
+        poles = find_poles(fit.test, monitor=monitor)
+    except (InputError, np.linalg.LinAlgError):
+        return []
+    kept = strongest_poles(Records(fit.test), poles, fit.model.m, np.ones(poles.omega.size, bool))
+    anew = record_modes(fit.test, poles.omega[kept], poles.ratios[kept], monitor=monitor)
+    return [refitted(anew, anew.parameters, monitor=monitor)]
+
+
+def left_of(fit: RecordFit) -> float:
+    """What a fit leaves of the accelerations against the base, over these: a rigid body leaves one."""
+    left = size = 0.0
+    for chunk in fit.model.chunks(fit.parameters):
+        moved = chunk.run.outputs[: fit.model.n] - real_times(fit.test.rigid_body, chunk.run.base)
+        left += float(np.sum(np.abs(chunk.error[: fit.model.n]) ** 2))
+        size += float(np.sum(np.abs(moved) ** 2))
+    return float(np.sqrt(left / size)) if size else 0.0
 
 
 def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
@@ -343,7 +401,8 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         *modes.at(order), p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
-        excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
+        excess_of(fit), varying_levels(fit), runs_in_motion(fit),
+        () if fit.model.whole.plain else unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
         delays=delays_of(fit), calibration=calibration,
     )  # fmt: skip

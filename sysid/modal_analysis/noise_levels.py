@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from sysid.modal_analysis.modal_model import base_noise, dots
 from sysid.modal_analysis.record_model import Parameters, RecordModel
@@ -28,6 +29,29 @@ def floors(model: RecordModel) -> Array:
     spectra = (np.vstack([run.outputs, run.base]) / np.sqrt(run.density) for run in model.runs)
     power = np.array([np.mean(np.abs(both) ** 2, axis=1) for both in spectra])
     return VANISHING**2 * np.where(power > 0, power, power.max())
+
+
+def bounded_by_lines(model: RecordModel, levels: Array, beyond: float = 1.1) -> Array:
+    """Variances of a sample, (pieces, c + d), at most what the quietest lines of each channel hold.
+
+    Those that are above by less than a factor of `beyond`, as a deviation, stay, as chance makes them; so do levels
+    that vary over the lines.
+    """
+    if model.whole.varying is not None:
+        return levels
+    both = (np.vstack([run.outputs, run.base]) for run in model.runs)
+    most = np.array([quietest(_squares(one) / run.density, 0.1) for one, run in zip(both, model.runs, strict=True)])
+    return np.where(levels > beyond**2 * most, most, levels)
+
+
+def quietest(power: Array, share: float, size: int = 16) -> Array:
+    """Mean of squares (channels, lines) of noise that holds as much in the quietest `share` of blocks, (channels,)."""
+    blocks = power.shape[1] // size
+    if blocks == 0:
+        return np.full(len(power), np.inf)
+    held = power[:, : blocks * size].reshape(len(power), blocks, size).mean(axis=2)
+    # Of noise alone the mean of so many squares is a gamma variable.
+    return np.asarray(np.quantile(held, share, axis=1) / (float(scipy.special.gammaincinv(size, share)) / size))
 
 
 def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns: int) -> Array:
@@ -50,6 +74,20 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
         rows = list(D)
         found[rows] = _of_run([part for part in parts if part.piece in D], D, levels[rows], least[rows])
     return found * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
+
+
+def plain_levels(model: RecordModel, p: Parameters) -> Array:
+    """Variances, likewise, as least squares has them: one of all lines of sensors, one of forces, the base's least."""
+    levels, left = floors(model), np.zeros(model.channels)
+    for chunk in model.chunks(p):
+        left += np.sum(_squares(chunk.error), axis=1)
+    lines = sum(run.w.size for run in model.runs)
+    beyond = model.numbers / max(model.numbers - model.unknowns, model.numbers / 4) / lines
+    density = np.array([run.density for run in model.runs])[:, None]
+    for part in (slice(0, model.n), slice(model.n, model.channels)):
+        if part.stop > part.start:
+            levels[:, part] = np.maximum(levels[:, part], beyond * left[part].mean() / density)
+    return levels
 
 
 def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:

@@ -21,7 +21,7 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
-from sysid.modal_analysis.noise_levels import floors, likeliest_levels
+from sysid.modal_analysis.noise_levels import bounded_by_lines, floors, likeliest_levels, plain_levels
 from sysid.modal_analysis.record_model import (
     HeldShapes,
     NormalEquations,
@@ -158,8 +158,11 @@ class RecordFit:
 
     @property
     def noise(self) -> NoiseLevels:
-        """The levels, stated or found, as standard deviations."""
-        root, n, d = np.sqrt(self.levels_of_runs), self.test.n_sensors, self.test.n_base
+        """The levels, stated or found, as standard deviations; found ones hold no more than the quietest lines."""
+        found = self.levels_of_runs
+        if self.model.whole.noise is None:
+            found = bounded_by_lines(self.model, found)
+        root, n, d = np.sqrt(found), self.test.n_sensors, self.test.n_base
         if len(root) == 1:
             root = root[0]
         force = root[..., n : n + d] if self.test.force is not None else None
@@ -172,7 +175,7 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains,
+            "gains": p.gains, "plain": self.model.whole.plain,
         }  # fmt: skip
 
     @classmethod
@@ -185,16 +188,10 @@ class RecordFit:
             Where it is of another test.
         """
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
-        test = replace(test, whole=replace(test.whole, varying=tree["varying"]))  # type: ignore[type-var]
-        coupling, kept = tree.get("coupling"), tree.get("kept")  # results of before hold none
-        p = Parameters(
-            Modes(**tree["modes"]),
-            tree["rigid"],
-            tree["ends"],
-            tree["traces"],
-            coupling,
-            tree.get("gains", np.zeros(0)),
-        )
+        coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
+        test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
+        ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
+        p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains)
         fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains]
@@ -265,7 +262,8 @@ def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | Non
 def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
     """The fit of the same records with other delays, or errors of gains, taken off."""
     assert test.whole is not None
-    test = replace(test, whole=replace(test.whole, varying=fit.model.whole.varying))
+    was = fit.model.whole
+    test = replace(test, whole=replace(test.whole, varying=was.varying, plain=was.plain))
     p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
     traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
     traces[..., :TRACES] = p.traces[..., :TRACES]
@@ -290,8 +288,10 @@ def _fit(
     """Modes and levels in turn."""
     test = model.test
     assert test.whole is not None
-    stated, least = test.whole.noise, floors(model)
-    if stated is not None:
+    stated, least, plain = test.whole.noise, floors(model), test.whole.plain
+    if plain:
+        levels = plain_levels(model, p)
+    elif stated is not None:
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = _rough_levels(model, p)
@@ -301,7 +301,8 @@ def _fit(
         if stated is not None:
             settled = done
             break
-        before, levels = levels, likeliest_levels(model, p, levels, model.unknowns)
+        before = levels
+        levels = plain_levels(model, p) if plain else likeliest_levels(model, p, levels, model.unknowns)
         if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
             settled = True
             break

@@ -34,7 +34,7 @@ from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance, mo
 
 _FEWEST = 8  # lines of a band
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
-_MISSED = 5.0  # times the noise, that what a model misses may be for a delay
+_MISSED = 5.0  # times the noise, that what a model misses may be for a delay or a gain
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
@@ -298,7 +298,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     asked, G = _asked_of_gains(fit), fit.test.rigid_body
     equations, (n, d) = fit.equations.at(asked), G.shape
     at = asked.size - 3 * n * d  # what is asked for comes behind all that was fitted
-    beyond = max(fit.reduced, 1.0)
+    beyond = max(fit.reduced, 1.0) * (_MISSED**2 if fit.model.whole.plain else 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(2 * n * d))
     normal, size = unit_diagonal(along.T @ equations.normal @ along)
     gradient = along.T @ equations.gradient / size

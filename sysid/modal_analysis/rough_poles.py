@@ -99,6 +99,13 @@ def _sines(test: Measurement, share: float = 0.9, few: float = 0.1) -> list[floa
     return found
 
 
+def at_few_lines(test: Measurement, share: float = 0.5, few: float = 0.01) -> bool:
+    """True where in a run so `few` of the lines, a share of all, hold this `share` of the base's power or more."""
+    runs = zip(test.base, test.own_lines, strict=True)
+    powers = [np.sort(np.sum(np.abs(base[:, lines]) ** 2, axis=0)) for base, lines in runs]
+    return any(one[-max(int(few * one.size), 1) :].sum() >= share * one.sum() for one in powers)
+
+
 def poles_of_test(test: Measurement) -> tuple[Array, Array]:
     """Poles of a test of any kind, rad/s and ratios, (m,) each: of whole records roughly, beside their transients.
 

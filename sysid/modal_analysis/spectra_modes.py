@@ -99,6 +99,15 @@ def fit_modes_of_lines(
     return with_couplings_of_lines(modal, monitor, max_iterations)
 
 
+def strongest_poles(records: Records, poles: Poles, count: int, inside: NDArray[np.bool_]) -> Integers:
+    """Numbers of so many poles `inside` (p,), those whose loss the records would feel most, and of all others."""
+    subsets, kept = SubsetFits(records, poles.omega, poles.ratios), np.arange(inside.size)
+    while np.count_nonzero(inside[kept]) > count:
+        worth, _ = subsets.worth(kept)
+        kept = np.delete(kept, np.argmin(np.where(inside[kept], worth, np.inf)))
+    return kept
+
+
 @dataclass(frozen=True, eq=False)
 class ModeFit:
     """Fit of rank-one modes at the poles of a test; a pole whose residue needs it stands for several modes.
@@ -207,10 +216,7 @@ class ModeFit:
         counts : (p,)
             Modes at each: where there are fewer poles, further ones where residues need them, at most as many as these.
         """
-        subsets, kept = SubsetFits(self.records, self.poles.omega, self.poles.ratios), np.arange(inside.size)
-        while np.count_nonzero(inside[kept]) > count:
-            worth, _ = subsets.worth(kept)
-            kept = np.delete(kept, np.argmin(np.where(inside[kept], worth, np.inf)))
+        kept = strongest_poles(self.records, self.poles, count, inside)
         fit, counts, inside = self._at(kept), np.ones(kept.size, dtype=int), inside[kept]
         lacking = count - np.count_nonzero(inside)
         if lacking > 0:

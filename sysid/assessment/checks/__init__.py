@@ -19,6 +19,7 @@ CHECKS: tuple[Check, ...] = (
     stated.stated_masses,
     search_end.missed_goal,
     model_error.beyond_noise,
+    model_error.least_squares,
     model_error.unpredicted_tests,
     stated.missed_values,
     against_records.records_of_fit,

@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from sysid.finding import Finding, Severity, contradicting
 from sysid.measurement.in_time import cut_in_motion, quiet_levels
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.noise_levels import quietest
 from sysid.modal_analysis.outliers import Outlier
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -159,18 +159,15 @@ def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np
 
 
 def _quiet(
-    left: ComplexArray, variance: Array, in_run: NDArray[np.bool_], size: int = 16, least: int = 8, share: float = 0.25
+    left: ComplexArray, variance: Array, in_run: NDArray[np.bool_], least: int = 128, share: float = 0.25
 ) -> Array | None:
-    """Power over the variance in the quietest `share` of blocks of lines, (runs, channels); None with few blocks."""
+    """Power over the variance in the quietest `share` of blocks of lines, (runs, channels); None with few lines."""
     out = np.ones(left.shape[:2])
-    mean = float(scipy.special.gammaincinv(size, share)) / size
     for run, lines in enumerate(in_run):
         power = np.abs(left[run][:, lines]) ** 2 / variance[run][:, lines]
-        blocks = power.shape[1] // size
-        if blocks < least:
+        if power.shape[1] < least:
             return None
-        held = power[:, : blocks * size].reshape(len(power), blocks, size).mean(axis=2)
-        out[run] = np.minimum(np.quantile(held, share, axis=1) / mean, power.mean(axis=1))
+        out[run] = np.minimum(quietest(power, share), power.mean(axis=1))
     return out
 
 

@@ -52,6 +52,25 @@ def beyond_noise(context: Context) -> Iterator[Finding]:
             )  # fmt: skip
 
 
+def least_squares(context: Context) -> Iterator[Finding]:
+    """No modes with noise in all channels explain whole records, and squares of what is left were fitted instead."""
+    if context.named or not context.is_judged:
+        return
+    for i, modal, structure in context.fits:
+        whole = modal.given.whole
+        if whole is not None and whole.plain:
+            left = modal.records.residual(structure)
+            which = "the records" if len(context.fits) == 1 else f"the records of test {i}"
+            yield Finding(
+                "least squares", context.weight,
+                f"no modes with noise in all channels explain {which}: they left more than least squares do, which "
+                f"were fitted instead, with the motion of the base as recorded ({100 * left:.3g} % missed, 100 % by a "
+                "rigid body)",
+                "look for what moves the structure beside the recorded base (another support, a load), and for parts "
+                "that yield, slip or rattle", numbers={"test": float(i), "residual": left},
+            )  # fmt: skip
+
+
 def unpredicted_tests(context: Context) -> Iterator[Finding]:
     """A test that was not fitted is predicted worse than by a rigid body."""
     if not context.is_judged or context.named:
