@@ -47,7 +47,8 @@ CEILINGS = {
     # expressions and residuals of the user's own (210),
     # damaged samples of records, found, left out or refused, and told (694),
     # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
-    "lines": 45_640,
+    # and sensors on soft brackets, rigid parts with sensors to spare, and what answers take for granted (300),
+    "lines": 45_940,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }
