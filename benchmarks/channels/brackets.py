@@ -43,7 +43,7 @@ QUICK = (0, 1, 3, 16)  # which take a second each
 NAMED = 0.9
 SHOWN = 0.003  # of the rigid-body mass, that each mode of masses and springs moves at least
 MODES = (3, 6)
-LONGEST = 40.0  # first mode above the lines over the first mode
+LONGEST = {beam: 40.0, frame: 12.0, plate: 12.0}  # first mode above the lines over the first mode, at most
 GAIN = 1.03
 CASES = ("clean", "soft", "gain", "model")
 KIND = "soft bracket"
@@ -194,7 +194,7 @@ def _with_part(rng: np.random.Generator, number: int, kind: str) -> Mounted:
         weights = np.max((shapes.T @ driven.load) ** 2 / np.diag(driven.rigid_body_mass), axis=1)
         room = [
             m for m in range(MODES[0], MODES[1] + 1)
-            if APART * omega[m - 1] < omega[m] < LONGEST * omega[0] and weights[:m].min() > SHOWN
+            if APART * omega[m - 1] < omega[m] < LONGEST[of] * omega[0] and weights[:m].min() > SHOWN
         ]  # fmt: skip
         if not room:
             continue

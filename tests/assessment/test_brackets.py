@@ -76,8 +76,7 @@ def told(result):
 
 
 class TestStatedMass:
-    @pytest.mark.parametrize("times", [2.0, 4.0])
-    @pytest.mark.parametrize("sensor", range(4))
+    @pytest.mark.parametrize(("sensor", "times"), [(0, 2.0), (1, 2.0), (2, 4.0), (3, 4.0)])
     def test_names_the_sensor_and_its_bracket(self, sensor, times):
         truth = storeys()
         soft = times * truth.natural_frequencies[-1]
@@ -86,7 +85,7 @@ class TestStatedMass:
         assert channel == f"sensor {sensor + 1}" and result.contradictions[0].kind == KIND
         assert abs(frequency - soft) < max(4 * std, 0.02 * soft)
 
-    @pytest.mark.parametrize("seed", range(6))
+    @pytest.mark.parametrize("seed", range(3))
     def test_names_none_of_a_right_test(self, seed):
         result = sysid.identify(Problem(shaken(storeys(), rng=seed), mass=LumpedMass()), rng=0)
         assert result.determined and not told(result)
@@ -99,6 +98,14 @@ class TestStatedMass:
         result = sysid.identify(Problem(dataclasses.replace(test, response=response), mass=LumpedMass()), rng=0)
         assert not told(result)
         assert f"sensor {sensor + 1}" in [one.channel for one in result.of_kind("gain", "rigid motion")]
+
+    @pytest.mark.parametrize("soft", [False, True])
+    def test_a_written_model_tells_it_too(self, soft):
+        truth, top = storeys(), storeys().natural_frequencies[-1]
+        test = on_bracket(shaken(truth), 2, 3 * top) if soft else shaken(truth)
+        stated = {"mass": truth.mass[:4, :4], "stiffness": sysid.ChainStiffness(1e5, 1e6)}
+        result = sysid.identify(Problem(test, **stated), rng=0)
+        assert [channel for channel, *_ in told(result)] == ["sensor 3"] * soft
 
     def test_names_none_beside_a_free_mass_which_takes_it_up(self):
         test = on_bracket(shaken(storeys()), 2, 3 * storeys().natural_frequencies[-1])
@@ -115,7 +122,7 @@ class TestRigidPart:
         assert channel == sensors[sensor].name
         assert abs(frequency - soft) < max(4 * std, 0.02 * soft)
 
-    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("seed", range(2))
     def test_names_none_of_a_right_test_nor_where_no_part_is_stated(self, seed):
         truth, sensors = block()
         assert not told(sysid.identify(Problem(shaken(truth, sensors, rng=seed)), rng=0))
@@ -181,6 +188,11 @@ class TestAssumptions:
         lumped = sysid.identify(Problem(test, mass=LumpedMass()), rng=0)
         assert "assumed mass" in self.kinds(lumped) and "assumed mounting" not in self.kinds(lumped)
         assert not set(self.kinds(free)) & {one.kind for one in free.findings}
+
+    def test_a_goal_that_is_met_makes_a_bracket_a_caution(self):
+        test = on_bracket(shaken(storeys()), 2, 4 * storeys().natural_frequencies[-1])
+        (one,) = sysid.identify(Problem(test, mass=LumpedMass(), goal=0.1), rng=0).of_kind(KIND)
+        assert one.severity == "caution"
 
     def test_leave_out_mountings_that_a_rigid_part_tells(self):
         truth, sensors = block()

@@ -22,7 +22,7 @@ from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import GainErrors, gain_errors
 from sysid.assessment.sensitivity import KNOWN, largest_deviations, left_by_constraints, rows_of
 from sysid.errors import InputError, listed
-from sysid.finding import Finding, Severity
+from sysid.finding import Finding
 from sysid.measurement.gains import tolerance_of
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import Record, noise_records
@@ -65,24 +65,24 @@ class SoftBracket(NamedTuple):
     others: tuple[int, ...]
 
 
-def soft_brackets(context: Context, largest: int = 1000) -> Iterator[Finding]:
+def soft_brackets(context: Context, largest: int = 400) -> Iterator[Finding]:
     """A sensor's mounting is soft: its record grows with frequency against a stated mass, or its rigid part.
 
     Beside a stated mass, shapes of up to the `largest` number of entries are looked at, which takes a second or two.
     """
     problem, end = context.problem.screened, context.end
-    if not context.is_judged or context.named:
+    if context.is_explained or context.named or context.has("changing"):
         return
-    test, last = problem.measurement, 2 * np.pi * float(problem.measurement.freq[-1])
+    last = 2 * np.pi * float(problem.measurement.freq[-1])
     if problem.answers_in_band:
         for part, misfit in misfits_of_parts(problem, end.structure):
             found = softest(misfit, last)
             if found is not None:
-                yield _finding(test, end.structure, found, f"its rigid part {part!r} moves")
+                yield _finding(context, found, f"its rigid part {part!r} moves")
     elif end.x is not None and problem.formulation.fits_records and end.structure.mode_shapes.size <= largest:
         found = _beside_model(problem, end.structure, end.x, last)
         if found is not None and _is_known(problem, end.structure, end.x):
-            yield _finding(test, end.structure, found, "the stated model moves there, if that is right")
+            yield _finding(context, found, "the stated model moves there, if that is right")
 
 
 def softest(misfit: Misfit, last: float, least: float = 2e-3) -> SoftBracket | None:
@@ -118,17 +118,17 @@ def _size(rows: Array) -> Array:
     return np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
 
 
-def _finding(test: Measurement, structure: Structure, found: SoftBracket, against: str) -> Finding:
+def _finding(context: Context, found: SoftBracket, against: str) -> Finding:
     """The finding of a bracket."""
+    test, frequencies = context.problem.measurement, context.end.structure.natural_frequencies
     i, names, frequency = found.sensor, test.sensor_names, found.softness**-0.5 / (2 * np.pi)
     std = frequency * found.std / (2 * found.softness)
-    inside = structure.natural_frequencies[structure.natural_frequencies <= test.freq[-1]]
-    top = float(inside[-1] if inside.size else test.freq[-1])
+    top = float(np.max(frequencies, where=frequencies <= test.freq[-1], initial=test.freq[0]))
     high = 1 / (1 - (top / frequency) ** 2) - 1
     which = listed([names[one] for one in (i, *found.others)], " or ")
     numbers = {"frequency": frequency, "std": std, "deviations": found.deviations, "error": high, "sensor": float(i)}
     return Finding(
-        "soft bracket", Severity.CONTRADICTS,
+        "soft bracket", context.weight,
         f"{which} is on a soft bracket: the higher the frequency, the more it reads than {against}, as on a mounting "
         f"of {frequency:.4g} Hz (standard deviation {std:.2g} Hz), {100 * high:.2g} % too much at {top:.4g} Hz. M_SS, "
         "K_SS and C are wrong in its row and column",
@@ -223,11 +223,11 @@ def _with_gains(problem: Prepared, misfit: Misfit, errors: GainErrors | None, us
     known = np.flatnonzero(np.isfinite(error) & np.isfinite(std) & (std > 0))
     rows = np.vstack([np.eye(n)[known] / std[known, None], np.diag(1 / usually)])
     values = np.concatenate([error[known] / std[known], np.zeros(n)])
-    none = np.zeros((values.size, n))
+    none, size = np.zeros((values.size, n)), misfit.left.size + values.size
     rows = np.pad(rows, ((0, 0), (0, misfit.beside.shape[1] - n)))
     return Misfit(
         np.concatenate([misfit.left, -values]), np.vstack([misfit.softness, none]), np.vstack([misfit.mended, none]),
-        np.vstack([misfit.beside, rows]), np.eye(misfit.left.size + values.size)[:, -n:],
+        np.vstack([misfit.beside, rows]), np.eye(size, n, n - size),
     )  # fmt: skip
 
 
