@@ -48,7 +48,7 @@ CEILINGS = {
     # damaged samples of records, found, left out or refused, and told (694),
     # and tolerances of gains of all channels, their moves of the modes, and tables that rock (660),
     # and sensors on soft brackets, rigid parts with sensors to spare, and what answers take for granted (300),
-    "lines": 45_940,
+    "lines": 45_955,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

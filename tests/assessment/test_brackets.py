@@ -150,30 +150,30 @@ class TestSoftest:
     def test_is_the_parameter_within_its_deviations(self):
         rng = np.random.default_rng(2)
         softness, beside = 200 * rng.standard_normal((300, 3)), rng.standard_normal((300, 5))
-        found = softest(self.make(rng, softness, beside, [0.0, 0.02, 0.0]), last=5.0)
+        found = softest(self.make(rng, softness, beside, [0.0, 0.02, 0.0]), top=4.0)
         assert found.sensor == 1 and not found.others
         left = softness - beside @ np.linalg.lstsq(beside, softness, rcond=None)[0]
         assert found.std == pytest.approx(1 / np.linalg.norm(left[:, 1]), rel=0.1)
         assert abs(found.softness - 0.02) < 4 * found.std
 
     @pytest.mark.parametrize("b", [[0.0, -0.02, 0.0], [0.02, 0.02, 0.0], [0.0, 0.05, 0.0]])
-    def test_is_none_that_reads_too_little_none_of_two_and_none_within_the_lines(self, b):
-        """A bracket reads too much; one explains not what two do; one of 0.05 is a mode at 4.5 rad/s."""
+    def test_is_none_that_reads_too_little_none_of_two_and_none_near_the_lines(self, b):
+        """A bracket reads too much; one explains not what two do; one of 0.05 s² is a mode at 4.5 rad/s."""
         rng = np.random.default_rng(3)
         softness, beside = 200 * rng.standard_normal((300, 3)), rng.standard_normal((300, 5))
-        assert softest(self.make(rng, softness, beside, b), last=5.0) is None
+        assert softest(self.make(rng, softness, beside, b), top=4.0) is None
 
     def test_leaves_it_to_a_gain_that_explains_it_as_well_and_tells_two_that_are_alike(self):
         rng = np.random.default_rng(4)
         softness, beside = 200 * rng.standard_normal((300, 2)), rng.standard_normal((300, 5))
         softness[:, 1] = softness[:, 0]
-        assert softest(self.make(rng, softness, beside, [0.02, 0.0]), last=5.0).others == (1,)
-        assert softest(self.make(rng, softness, beside, [0.02, 0.0], gains=softness[:, :1]), last=5.0) is None
+        assert softest(self.make(rng, softness, beside, [0.02, 0.0]), top=4.0).others == (1,)
+        assert softest(self.make(rng, softness, beside, [0.02, 0.0], gains=softness[:, :1]), top=4.0) is None
 
     def test_false_alarms_are_as_rare_as_stated(self):
         rng = np.random.default_rng(5)
         softness, beside = rng.standard_normal((40, 4)), rng.standard_normal((40, 6))
-        found = [softest(self.make(rng, 1e3 * softness, beside), last=5.0, least=0.0) for _ in range(3000)]
+        found = [softest(self.make(rng, 1e3 * softness, beside), top=4.0, least=0.0) for _ in range(3000)]
         assert np.count_nonzero([one is not None for one in found]) <= 9  # of 3 expected
 
 

@@ -42,14 +42,14 @@ class Misfit(NamedTuple):
     """Misfits of what is stated, in standard deviations (rows,), and what they change by.
 
     `softness` (rows, n_sensors): by each sensor's b, s², of the motion that is fitted; `mended`: likewise, of what was
-    recorded. `beside` (rows, k): by all that is free beside. `gains` (rows, l): by gains farther off than usual.
+    recorded. `beside` (rows, k): by all that is free beside. `others` (rows, l): by what else may be wrong, one by one.
     """
 
     left: Array
     softness: Array
     mended: Array
     beside: Array
-    gains: Array
+    others: Array
 
 
 class SoftBracket(NamedTuple):
@@ -73,27 +73,34 @@ def soft_brackets(context: Context, largest: int = 400) -> Iterator[Finding]:
     problem, end = context.problem.screened, context.end
     if context.is_explained or context.named or context.has("changing"):
         return
-    last = 2 * np.pi * float(problem.measurement.freq[-1])
+    top = 2 * np.pi * _highest(context)
     if problem.answers_in_band:
         for part, misfit in misfits_of_parts(problem, end.structure):
-            found = softest(misfit, last)
+            found = softest(misfit, top)
             if found is not None:
                 yield _finding(context, found, f"its rigid part {part!r} moves")
     elif end.x is not None and problem.formulation.fits_records and end.structure.mode_shapes.size <= largest:
-        found = _beside_model(problem, end.structure, end.x, last)
+        found = _beside_model(problem, end.structure, end.x, top)
         if found is not None and _is_known(problem, end.structure, end.x):
             yield _finding(context, found, "the stated model moves there, if that is right")
 
 
-def softest(misfit: Misfit, last: float, least: float = 2e-3) -> SoftBracket | None:
-    """The bracket that explains a misfit, and no gain or delay does; None where chance, or something else, may.
+def _highest(context: Context) -> float:
+    """Frequency of the highest mode within the lines, Hz."""
+    freq, frequencies = context.problem.measurement.freq, context.end.structure.natural_frequencies
+    return float(np.max(frequencies, where=frequencies <= freq[-1], initial=freq[0]))
 
-    Of sensors that read `least` to any times too much at `last`, rad/s, above which the bracket resounds.
+
+def softest(misfit: Misfit, top: float, least: float = 2e-3, most: float = 1 / 3) -> SoftBracket | None:
+    """The bracket that explains a misfit; None where chance does, or anything else that may be wrong.
+
+    Of sensors whose motion is from `least` to `most` less than they read at the highest mode, `top`, rad/s: a bracket
+    nearer to it shows as a mode of its own.
     """
     U, s, _ = np.linalg.svd(misfit.beside / _size(misfit.beside), full_matrices=False)
     U = U[:, s > ROUND_OFF * s.max(initial=0.0)]
     off = lambda rows: rows - U @ (U.T @ rows)  # noqa: E731
-    left, softness, mended, gains = (off(off(rows)) for rows in (*misfit[:3], misfit.gains))
+    left, softness, mended, wrong = (off(off(rows)) for rows in (*misfit[:3], misfit.others))
     size, products = _size(softness), np.sum(softness * mended, axis=0)
     seen = size > NEGLIGIBLE * _size(misfit.softness)
     along = np.where(seen & (products > 0), -(softness.T @ left) / size, 0.0)
@@ -103,11 +110,12 @@ def softest(misfit: Misfit, last: float, least: float = 2e-3) -> SoftBracket | N
     b, gained = float(along[i] * size[i] / products[i]), float(along[i] ** 2)
     before, after = float(left @ left), float(np.sum((left + b * mended[:, i]) ** 2))
     noise = max(after / freedom, 1.0)
-    by_gain = float(np.max((gains.T @ left) ** 2 / _size(gains) ** 2, initial=0.0))
+    wrong = wrong[:, _size(wrong) > NEGLIGIBLE * _size(misfit.others)]
+    elsewhere = float(np.max(((wrong / _size(wrong)).T @ left) ** 2, initial=0.0))
     by_chance = beyond_chance(1, int(np.count_nonzero(seen)) // 2)  # on one side
     explained = after < beyond_chance(freedom) or after - freedom < MENDED**2 * (before - freedom)
-    clear = gained > noise * by_chance and gained > by_gain + noise * LIKELY**2
-    if not (clear and explained and least < b * last**2 < 1):
+    clear = gained > noise * by_chance and gained > elsewhere + noise * beyond_chance(1)
+    if not (clear and explained and least < b * top**2 < most):
         return None
     others = np.flatnonzero((along > 0) & (along**2 > gained - LIKELY**2 * noise))
     std = float(np.sqrt(noise) * size[i] / products[i])
@@ -120,10 +128,9 @@ def _size(rows: Array) -> Array:
 
 def _finding(context: Context, found: SoftBracket, against: str) -> Finding:
     """The finding of a bracket."""
-    test, frequencies = context.problem.measurement, context.end.structure.natural_frequencies
+    test, top = context.problem.measurement, _highest(context)
     i, names, frequency = found.sensor, test.sensor_names, found.softness**-0.5 / (2 * np.pi)
     std = frequency * found.std / (2 * found.softness)
-    top = float(np.max(frequencies, where=frequencies <= test.freq[-1], initial=test.freq[0]))
     high = 1 / (1 - (top / frequency) ** 2) - 1
     which = listed([names[one] for one in (i, *found.others)], " or ")
     numbers = {"frequency": frequency, "std": std, "deviations": found.deviations, "error": high, "sensor": float(i)}
@@ -146,14 +153,12 @@ def _is_known(problem: Prepared, structure: Structure, x: Array) -> bool:
     return all(one <= KNOWN for one in largest_deviations(structure, (u.mass, u.stiffness, u.damping)).values())
 
 
-def _beside_model(
-    problem: Prepared, structure: Structure, x: Array, last: float, rounds: int = 3
-) -> SoftBracket | None:
+def _beside_model(problem: Prepared, structure: Structure, x: Array, top: float, rounds: int = 3) -> SoftBracket | None:
     """The bracket that explains the misfit of a model, by Gauss-Newton steps of its unknowns and b."""
     found = None
     for _ in range(rounds):
         misfit, directions = misfit_of_model(problem, structure, x)
-        better = softest(misfit, last)
+        better = softest(misfit, top)
         if better is None:
             break
         found, bracket = better, misfit.mended[:, [better.sensor]]
@@ -225,9 +230,10 @@ def _with_gains(problem: Prepared, misfit: Misfit, errors: GainErrors | None, us
     values = np.concatenate([error[known] / std[known], np.zeros(n)])
     none, size = np.zeros((values.size, n)), misfit.left.size + values.size
     rows = np.pad(rows, ((0, 0), (0, misfit.beside.shape[1] - n)))
+    others = np.pad(misfit.others, ((0, values.size), (0, 0)))
     return Misfit(
         np.concatenate([misfit.left, -values]), np.vstack([misfit.softness, none]), np.vstack([misfit.mended, none]),
-        np.vstack([misfit.beside, rows]), np.eye(size, n, n - size),
+        np.vstack([misfit.beside, rows]), np.hstack([others, np.eye(size, n, n - size)]),
     )  # fmt: skip
 
 
@@ -236,17 +242,24 @@ def misfits_of_parts(problem: Prepared, structure: Structure) -> Iterator[tuple[
     test, unknowns = problem.measurement, structure.mode_shapes.size
     parts = [sensor.part for sensor in test.sensors or ()]
     for part in dict.fromkeys(filter(None, parts)):
-        sums = beside_rigid(test, np.array([one == part for one in parts]))
+        mine = np.array([one == part for one in parts])
+        sums = beside_rigid(test, mine)
         if not len(sums):
             continue
         noise, inside = noise_records(test, structure, unknowns)[0], np.concatenate(test.own_lines)
         std = _shared(noise, test, unknowns) * np.sqrt(sums**2 @ noise.std[:, inside] ** 2 / 2)  # of a real number
+        changes = _changes(test, structure)
+        # A sensor that is not where it is said to be reads a rotation of the part besides.
+        turns = np.linalg.pinv(_rigid_rows(test, mine), NEGLIGIBLE)[3:] @ changes[2][mine]
+        far = np.linalg.norm(turns, axis=1) > NEGLIGIBLE * np.linalg.norm(changes[2][mine])
+        places = [np.tile(turn, (test.n_sensors, 1)) for turn in turns[far]]
         every = [
             (sums[:, None] * record.T[inside] / std[..., None]).reshape(-1, test.n_sensors)
-            for record in (columns(test.response), *_changes(test, structure))
+            for record in (columns(test.response), *changes, *places)
         ]
-        left, softness, mended, *beside = (np.concatenate([one.real, one.imag]) for one in every)
-        found = Misfit(left.sum(axis=1), -softness, -mended, -np.hstack(beside), np.zeros((len(left), 0)))
+        left, softness, mended, gains, delays, *turned = (np.concatenate([one.real, one.imag]) for one in every)
+        others = np.hstack([np.zeros((len(left), 0)), *turned])
+        found = Misfit(left.sum(axis=1), -softness, -mended, -np.hstack([gains, delays]), others)
         yield part, _with_gains(problem, found, gain_errors(problem.modal[0], structure))
 
 
@@ -256,14 +269,19 @@ def _shared(noise: Record, test: Measurement, unknowns: int) -> float:
     return float(np.sqrt(line_correlation(error, unknowns)))
 
 
-def beside_rigid(test: Measurement, mine: NDArray[np.bool_]) -> Array:
-    """Sums of the sensors `mine` (n_sensors,) that no rigid motion of all of them makes, orthonormal (k, n_sensors)."""
+def _rigid_rows(test: Measurement, mine: NDArray[np.bool_]) -> Array:
+    """Motion of some sensors (count, 6) with a rigid body about their centre, its rotations in units of their reach."""
     sensors = [sensor for sensor, its in zip(test.sensors or (), mine, strict=True) if its]
     places = np.array([sensor.position for sensor in sensors], dtype=float)
     centre = places.mean(axis=0)
     rows = rigid_body(sensors=sensors, base_axes=BASE_AXES, origin=tuple(centre.tolist()))
     rows[:, 3:] /= max(float(np.abs(places - centre).max()), np.finfo(float).tiny)
-    sums = scipy.linalg.null_space(rows.T, rcond=NEGLIGIBLE).T
+    return rows
+
+
+def beside_rigid(test: Measurement, mine: NDArray[np.bool_]) -> Array:
+    """Sums of the sensors `mine` (n_sensors,) that no rigid motion of all of them makes, orthonormal (k, n_sensors)."""
+    sums = scipy.linalg.null_space(_rigid_rows(test, mine).T, rcond=NEGLIGIBLE).T
     found = np.zeros((len(sums), mine.size))
     found[:, mine] = sums
     return found
