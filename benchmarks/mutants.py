@@ -189,7 +189,7 @@ NOTICED = (
     Mutant("C06c", "a doubtful fit ends with status 0",
         'return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED',
         "return SUCCESS if result.success else NOT_REACHED", "test_cli_ends"),
-    Mutant("C07", "matrices that noise leaves open called determined", "if not largest <= _KNOWN:", "if False:",
+    Mutant("C07", "matrices that noise leaves open called determined", "if not largest <= KNOWN:", "if False:",
         "test_certainty"),
     Mutant("C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], at_identity[i, j])",
         "np.maximum(values[1], at_identity[i, j]) * 1.01", "test_intervals"),

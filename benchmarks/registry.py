@@ -224,6 +224,9 @@ BENCHMARKS = (
     Benchmark(
         "channels.signed_exports", "exported files of a sensor at -x: sign in the row's name, or turned", "5 s", "3 s"
     ),
+    Benchmark(
+        "channels.brackets", "a sensor on a soft bracket: named with redundancy, none of sound tests", "20 min", "15 s"
+    ),
     Benchmark("channels.damaged", "damaged samples: kind and channel told; nothing of sound tests", "6 min", "20 s"),
     Benchmark(
         "laboratory.reader_files", "files of laboratories and their broken twins: right, or one line", "10 s", "10 s"

@@ -14,7 +14,7 @@ import numpy as np
 Kind = Literal[
     # Mistakes in records, or in what is stated of them; the first of them explains what else speaks against a fit.
     "conjugated spectra", "late sensor", "relative responses", "positions", "unit", "sign", "swapped sensors", "gain",
-    "table rocks", "force sign", "force unit", "frequencies in rad/s", "short segments",
+    "table rocks", "soft bracket", "force sign", "force unit", "frequencies in rad/s", "short segments",
     # Damaged samples that are left in the records, or were left out.
     "clipped", "dropout", "held value", "spikes", "tone", "equal channels",
     # What speaks against a fit.
@@ -25,9 +25,11 @@ Kind = Literal[
     # What leaves the matrices open.
     "not judged", "other answers", "open", "noise", "modes not all tried",
     # What is to be known besides.
-    "fixed", "strategy", "search", "ending", "on a bound", "search box", "assumed total", "level", "lines left out",
-    "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio", "assumed gain",
-    "assumed force gain", "gain not shown", "noise not judged", "modes below",
+    "fixed", "strategy", "search", "ending", "on a bound", "search box", "level", "lines left out",
+    "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio",
+    "gain not shown", "noise not judged", "modes below",
+    # What an answer takes for granted.
+    "assumed total", "assumed mass", "assumed gain", "assumed force gain", "assumed mounting", "assumed base",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Judgement = Literal["determined", "one of many", "doubtful", "no fit"]

@@ -50,7 +50,8 @@ CEILINGS = {
     # and files of LabVIEW, strong-motion records, runs of joined files and base sensors told apart (310),
     # and the kind of test that a file seems to be, with what is missing (125),
     # and least squares of whole records that no modes explain, and levels that quiet lines bound (130),
-    "lines": 46_230,
+    # and sensors on soft brackets, rigid parts with sensors to spare, and what answers take for granted (300),
+    "lines": 46_650,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }

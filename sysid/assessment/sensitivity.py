@@ -24,6 +24,8 @@ from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
+KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
+
 
 def parametrisation(problem: Prepared, structure: Structure, modes: Modes, index: Index) -> Parametrisation:
     """Theta itself, less what the damping model and stated totals tie."""
@@ -211,6 +213,16 @@ def system_matrices(structure: Structure) -> tuple[Array, Array, Array]:
     """M_SS, K_SS and C, (n, n) each."""
     n = structure.n
     return structure.mass[:n, :n], structure.stiffness[:n, :n], structure.damping
+
+
+def largest_deviations(structure: Structure, stds: Sequence[Array]) -> dict[str, float]:
+    """Largest of the deviations `stds` of M_SS, K_SS, C over the root of two diagonal entries each; NaN where open."""
+    found = {}
+    for name, matrix, std in zip(("M_SS", "K_SS", "C"), system_matrices(structure), stds, strict=True):
+        size = np.sqrt(np.diag(matrix))
+        size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
+        found[name] = float(np.max(std / np.outer(size, size)))
+    return found
 
 
 def blocks_and_slopes(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:

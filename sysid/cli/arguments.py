@@ -267,7 +267,7 @@ def _add_read(command: Adder) -> None:
         nargs="+",
         default=[],
         metavar=("COLUMN", "KEY=VALUE"),
-        help="one sensor: role=base|response|force axis=x position=0,0,3 unit=g gain=0.995 delay=0.002 name=NAME",
+        help="one sensor: role=base|response|force axis=x position=0,0,3 unit=g gain=0.995 delay=0.002 part=A name=B",
     )
     read.add_argument("--rate", type=float, metavar="HZ", help="samples a second, where no column has the time")
     read.add_argument("--time", metavar="COLUMN", help="the column of time")

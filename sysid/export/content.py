@@ -157,7 +157,7 @@ def statements(content: Content, precision: str) -> tuple[str, ...]:
         f"judgement: {reliability(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
-        *(f"assumed: {text}" for text in it.facts.assumed),
+        *(f"assumed: {text}" for text in it.assumptions),
         *(f"against: {one}" for one in it.contradictions),
         *(f"open: {one}" for one in it.open_findings),
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",

@@ -119,6 +119,8 @@ def described(recordings: Sequence[Recording], said: Description) -> tuple[Descr
     turns = "r" in (said.base_axes or "".join(str(one.axis) for one in channels if one.role == "base"))
     lost = next((one.name for one in channels if turns and one.role == "response" and one.position is None), None)
     refuse((lost, f"{said.place}: the base turns, and the position of {lost!r} is missing: position, in m"))
+    lost = next((one.name for one in channels if one.part and one.position is None), None)
+    refuse((lost, f"{said.place}: {lost!r} is on a rigid part, and its position is missing: position, in m"))
     placed = [replace(one, position=one.position or (0.0, 0.0, 0.0)) for one in channels]
     remarks += [f"{one.path}: {remark}" for one in recordings for remark in one.remarks]
     return replace(said, channels=tuple(placed)), remarks
@@ -128,7 +130,10 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
     """The sensors of the responses, each once."""
     found = {channel.name: channel for channel in said.channels if channel.role == "response"}
     points = {name: channel.position or (0.0, 0.0, 0.0) for name, channel in found.items()}
-    return tuple(Sensor(name, points[name], channel.axis, gain_std=channel.gain_std) for name, channel in found.items())
+    return tuple(
+        Sensor(name, points[name], channel.axis, gain_std=channel.gain_std, part=channel.part)
+        for name, channel in found.items()
+    )
 
 
 def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Array | None]:

@@ -12,7 +12,7 @@ from sysid.errors import InputError, as_float, choice, flag, path_of, printable,
 from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
-_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "gain_std", "delay", "reference")
+_FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "gain_std", "delay", "part", "reference")
 _TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join", "align")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
@@ -36,7 +36,8 @@ position = [0.0, 0.0, 3.0]     # m
 class Channel:
     """Description of one column, which is divided by `gain`, known to `gain_std`, and earlier by `delay`, s.
 
-    `axis`, `position` are None where the file tells them.
+    `part` is the rigid part that a sensor is fixed to, "" for none. `axis`, `position` are None where the file tells
+    them.
     """
 
     column: str | int
@@ -49,6 +50,7 @@ class Channel:
     gain: float
     delay: float = 0.0
     gain_std: float = 0.0
+    part: str = ""
 
 
 @dataclass(frozen=True)
@@ -167,12 +169,14 @@ def _channel(entry: Any, place: str) -> Channel:
         axis = axis if isinstance(axis, str) else tuple(map(float, axis))
     x, y, z = vector3((0.0, 0.0, 0.0) if where is None else where, f"{place}: position").tolist()
     name = text(f"{place}: name", entry.get("name", str(column)))
-    unit, reference = (printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference"))
+    unit, reference, part = (
+        printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference", "part")
+    )
     gain = as_float(f"{place}: gain", entry.get("gain", 1.0), "a positive number, such as 0.995,", above=0)
     gain_std = as_float(f"{place}: gain_std", entry.get("gain_std", 0.0), "a fraction, such as 0.005,", at_least=0)
     delay = as_float(f"{place}: delay", entry.get("delay", 0.0), "a number of seconds, such as 0.002,")
     at = None if where is None else (x, y, z)
-    return Channel(column, entry["role"], axis, name, at, unit, reference, gain, delay, gain_std)
+    return Channel(column, entry["role"], axis, name, at, unit, reference, gain, delay, gain_std, part)
 
 
 def description_file(path: Path) -> Path | None:

@@ -164,6 +164,7 @@ def trust(it: Identification) -> str:
         ("What the data do not determine", open_),
         ("What fixes the matrices", it.closed_by),
         ("What to measure or to do next", steps if len(steps) > 1 else ()),  # one alone stands in the opening
+        ("What no record of this test can show", [str(one) for one in it.assumptions]),
         ("To be known besides", [str(one) for one in it.notes]),
     ]
     return "".join(f"<h3>{name}</h3>{bullets(map(sentence, sentences))}" for name, sentences in parts if sentences)

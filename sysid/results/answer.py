@@ -151,6 +151,11 @@ class Answer:
         """Findings to be known besides, but for why the strategy was taken, and how it ended."""
         return self.of_kind(*(set(KINDS) - {"fixed", "strategy", "ending"}), severity=Severity.NOTE)
 
+    @property
+    def assumptions(self) -> tuple[Finding, ...]:
+        """Assumptions that the matrices rest on and no record of this test can show to be wrong; none without a fit."""
+        return self.facts.assumed if self.success else ()
+
     def of_kind(self, *kinds: str, severity: Severity | None = None) -> tuple[Finding, ...]:
         """Findings of these kinds, and of one severity if it is given."""
         return tuple(one for one in self.findings if one.kind in kinds and severity in (None, one.severity))

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sysid.assessment.checks.gains import taken_at_sensors
+from sysid.assessment.assumptions import assumptions
 from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
+from sysid.finding import Finding
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
@@ -54,7 +55,7 @@ class Facts(NamedTuple):
     these alone are fitted, which leave a common factor of M, K and C open. `misses`: what was stated as known to some
     accuracy, and by how many standard deviations the answer misses it. `counts`: scalar unknowns a matrix. `models`: a
     matrix, and its model with what that states. `stated_rigid_body`: which entries of the rigid-body mass are stated.
-    `assumed`: sentences.
+    `assumed`: what no record can test.
     """
 
     unit_mass: bool
@@ -68,7 +69,7 @@ class Facts(NamedTuple):
     n_variables: int
     models: tuple[tuple[str, str], ...]
     stated_rigid_body: Array
-    assumed: tuple[str, ...]
+    assumed: tuple[Finding, ...]
     tells_damping: bool
 
     def to_tree(self) -> dict[str, Any]:
@@ -77,6 +78,7 @@ class Facts(NamedTuple):
             "misses": [{"name": name, "deviations": z} for name, z in self.misses],
             "counts": [{"name": name, "count": count} for name, count in self.counts],
             "models": [{"name": name, "words": words} for name, words in self.models],
+            "assumed": [one.to_tree() for one in self.assumed],
         }
         unknowns = [{**one._asdict(), "shape": np.array(one.shape, dtype=np.int64)} for one in self.unknowns]
         return self._asdict() | lists | {"unknowns": unknowns}
@@ -88,6 +90,7 @@ class Facts(NamedTuple):
             "misses": tuple((one["name"], one["deviations"]) for one in tree["misses"]),
             "counts": tuple((one["name"], one["count"]) for one in tree["counts"]),
             "models": tuple((one["name"], one["words"]) for one in tree["models"]),
+            "assumed": tuple(map(Finding.from_tree, tree["assumed"])),
         }
         unknowns = tuple(ReportedUnknown(**{**one, "shape": tuple(one["shape"].tolist())}) for one in tree["unknowns"])
         return cls(**{name: tree[name] for name in cls._fields} | lists | {"unknowns": unknowns})
@@ -122,7 +125,7 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
         n_variables=problem.n_variables,
         models=tuple(_models(problem)),
         stated_rigid_body=_stated_rigid_body(problem),
-        assumed=tuple(map(str, taken_at_sensors(problem))),
+        assumed=assumptions(problem),
         tells_damping=bool(formulation.tells_damping),
     )
 

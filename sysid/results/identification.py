@@ -211,10 +211,8 @@ class Identification(Answer):
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
-            "findings": [
-                {**one._asdict(), "numbers": {name: _plain(np.array(z, float)) for name, z in one.numbers.items()}}
-                for one in self.findings
-            ],
+            "findings": [_figures(one) for one in self.findings],
+            "assumptions": [_figures(one) for one in self.assumptions],
             "outliers": [
                 {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
                 for o in self.outliers
@@ -429,6 +427,11 @@ def _is_plain(value: Any) -> bool:
         return bool(ast.literal_eval(repr(value)) == value)
     except (ValueError, TypeError, SyntaxError, RecursionError):
         return False
+
+
+def _figures(one: Finding) -> dict[str, Any]:
+    """A finding by its fields."""
+    return {**one._asdict(), "numbers": {name: _plain(np.array(z, float)) for name, z in one.numbers.items()}}
 
 
 def _plain(values: Array) -> Any:

@@ -10,10 +10,10 @@ import numpy as np
 
 from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK
 from sysid.assessment.checks.context import Context, run
-from sysid.assessment.checks.gains import assumed, rests_on
+from sysid.assessment.checks.gains import rests_on
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.information import Index
-from sysid.assessment.sensitivity import system_matrices
+from sysid.assessment.sensitivity import KNOWN, largest_deviations
 from sysid.assessment.statements import Adjusted, Statements, adjust, predict_statements, statements_of
 from sysid.assessment.uncertainty import LARGE, moves_by_records
 from sysid.errors import InputError, listed
@@ -32,7 +32,6 @@ from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
 
-_KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _NOT_JUDGED = Finding(
     "not judged", Severity.CAUTION,
     "what data and model determine, and how far noise leaves it known, was not judged: the time or Ctrl-C ended it",
@@ -67,7 +66,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
         open_, closed = (_NOT_JUDGED,), ()
     found = [*context.found, *end.findings, *open_]
     if not (contradicting(found) or cautions(found)):
-        found = [*closed, *found, *assumed(prepared)]
+        found = [*closed, *found]
     strategy, ending = Finding("strategy", Severity.NOTE, why), Finding("ending", Severity.NOTE, end.message)
     it = Identification(
         structure=end.structure,
@@ -114,12 +113,8 @@ def _check_precision(it: Identification) -> Iterator[Finding]:
         yield Finding("noise not judged", Severity.NOTE, sentence)
         return
     u, open_ = it.uncertainty, False
-    stds = (u.mass, u.stiffness, u.damping)
-    for name, matrix, std in zip(("M_SS", "K_SS", "C"), system_matrices(it.structure), stds, strict=True):
-        size = np.sqrt(np.diag(matrix))
-        size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
-        largest = float(np.max(std / np.outer(size, size)))
-        if not largest <= _KNOWN:
+    for name, largest in largest_deviations(it.structure, (u.mass, u.stiffness, u.damping)).items():
+        if not largest <= KNOWN:
             up_to = "open" if np.isnan(largest) else f"with standard deviations up to {100 * largest:.2g} %"
             sentence, open_ = f"noise leaves entries of {name} {up_to}", True
             yield Finding("noise", Severity.CAUTION, sentence, numbers={"largest": largest})

@@ -77,6 +77,7 @@ def summary(it: Answer) -> str:
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
         rest += _ranges(it)
     lines += ["besides:"] * bool(rest) + rest
+    lines += [f"assumed: {one}" for one in it.assumptions]
     lines += [_NOT_COMPUTED] * it.hurried
     lines.append(f"search: {it.message}")
     return "\n".join(folded(line) for line in lines)

@@ -89,6 +89,8 @@ class Sensor:
         s, by which its records are late. A `Measurement` takes it off when it is made: its sensors have none.
     gain_std : float
         Tolerance of its gain: standard deviation of the relative error, such as 0.005; exact by default.
+    part : str
+        Name of the rigid part that it is fixed to, such as "deck": its sensors move as one rigid body. None by default.
 
     Raises
     ------
@@ -101,6 +103,7 @@ class Sensor:
     axis: str | tuple[float, float, float]
     delay: float = 0.0
     gain_std: float = 0.0
+    part: str = ""
 
     def __post_init__(self) -> None:
         label = f"sensor {text('the name of a Sensor', self.name)!r}"
@@ -108,18 +111,21 @@ class Sensor:
         sensor_row(self.axis, label)
         as_float(f"the delay of {label}", self.delay, "a number of seconds, such as 0.002")
         as_float(f"gain_std of {label}", self.gain_std, "a fraction, such as 0.005", at_least=0)
+        if self.part != "":
+            text(f"the part of {label}", self.part)
 
     def to_tree(self) -> dict[str, Any]:
         """Name, position and axis as strings and arrays, for `from_tree`; those of a test have no delay."""
         axis = self.axis if isinstance(self.axis, str) else np.array(self.axis, dtype=float)
-        own = {"gain_std": self.gain_std} if self.gain_std else {}
+        own = {name: value for name in ("gain_std", "part") if (value := getattr(self, name))}
         return {"name": self.name, "position": np.array(self.position, dtype=float), "axis": axis, **own}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Sensor:
         """Sensor from a dictionary that `to_tree` made."""
         axis = tree["axis"] if isinstance(tree["axis"], str) else tuple(tree["axis"].tolist())
-        return cls(tree["name"], tuple(tree["position"].tolist()), axis, gain_std=tree.get("gain_std", 0.0))
+        own = {name: tree[name] for name in ("gain_std", "part") if name in tree}
+        return cls(tree["name"], tuple(tree["position"].tolist()), axis, **own)
 
 
 def checked_sensors(given: Sequence[Any] | None) -> tuple[Sensor, ...] | None:

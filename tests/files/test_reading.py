@@ -260,6 +260,20 @@ def test_a_stated_gain_divides_its_channel_in_records_and_spectra(tmp_path):
     np.testing.assert_allclose(test.force, plain.force / 0.8, rtol=1e-12)
 
 
+def test_a_rigid_part_is_stated_of_sensors_with_a_place(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.csv").write_text("\n".join(table()))
+    base, top = ["--sensor", "table", "role=base", "axis=x"], ["--sensor", "top", "role=response", "axis=x"]
+    words = ["read", "run.csv", *base, *top]
+    assert cli.main([*words, "position=0,0,2", "part=deck"]) == 0
+    (sensor,) = recorded_test.load("test.h5").measurement().sensors
+    assert (sensor.part, sensor.position) == ("deck", (0.0, 0.0, 2.0))
+    capsys.readouterr()
+    assert cli.main([*words, "part=deck"]) == 2
+    refused = capsys.readouterr().err
+    assert refused.count("\n") == 1 and "'top'" in refused and "position" in refused
+
+
 def test_gain_and_delay_are_stated_at_the_command_line_too(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.csv").write_text("\n".join(table()))

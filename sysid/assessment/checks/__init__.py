@@ -6,7 +6,16 @@ the table in docs/mistakes.md is made. Before a search the records alone are loo
 
 from __future__ import annotations
 
-from sysid.assessment.checks import against_records, damaged_samples, gains, mistakes, model_error, search_end, stated
+from sysid.assessment.checks import (
+    against_records,
+    brackets,
+    damaged_samples,
+    gains,
+    mistakes,
+    model_error,
+    search_end,
+    stated,
+)
 from sysid.assessment.checks.context import Check
 
 CHECKS: tuple[Check, ...] = (
@@ -16,6 +25,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
+    brackets.soft_brackets,
     stated.stated_masses,
     search_end.missed_goal,
     model_error.beyond_noise,
@@ -29,7 +39,6 @@ CHECKS: tuple[Check, ...] = (
     search_end.untried_modes,
     stated.on_a_bound,
     search_end.search_boxes,
-    gains.assumed_totals,
     gains.modes_below,
     model_error.other_levels,
     search_end.lines_left_out,

@@ -251,11 +251,11 @@ class Context:
 
     @property
     def is_explained(self) -> bool:
-        """True where nothing more is to be told: no fit to judge, bounds that keep it, or a mistake that was named.
+        """True where nothing more is to be told: no fit to judge, bounds that keep it, a soft bracket, a named mistake.
 
         Beside that mistake averages over segments are looked at all the same, for their leakage.
         """
-        if not self.is_judged or self.has("bounds"):
+        if not self.is_judged or self.has("bounds", "soft bracket"):
             return True
         return bool(self.named) and not self.problem.screened.measurement.averaged
 

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
-from sysid.measurement.gains import seen_at_sensors, tolerance_of
+from sysid.measurement.gains import seen_at_sensors
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gains_and_slopes, modes_above
-from sysid.problem.prepared import Prepared
 from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
@@ -261,50 +260,6 @@ def _rocking(test: Measurement, errors: GainErrors, axis: int, most: float = 0.5
                 channel=f"base {test.base_axes[axis]}", numbers={"slope": slope, "std": size**-0.5},
             )  # fmt: skip
             return
-
-
-def assumed(problem: Prepared) -> Iterator[Finding]:
-    """Gains on which masses rest and that no record can show to be wrong."""
-    test, mass = problem.measurement, problem.formulation.mass
-    if mass.entries is not None and np.all(np.isfinite(mass.entries)):
-        return
-    moved, tolerance = np.any(test.rigid_body, axis=1), tolerance_of(problem.stated.measurement)
-    still = [test.sensor_names[i] for i in np.flatnonzero(~moved & (tolerance[: moved.size] == 0))]
-    for name in still:
-        yield Finding(
-            "assumed gain", Severity.NOTE,
-            f"no record can show whether the gain of {name} is right, as its row of rigid_body is zero. An error of "
-            "1 % in it makes 2 % in the diagonal of M_SS, K_SS and C there",
-            channel=name,
-        )  # fmt: skip
-    if test.force is not None and mass.totals is None and not np.any(tolerance[-test.n_base :]):
-        yield Finding(
-            "assumed force gain", Severity.NOTE,
-            "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: an "
-            "error of 1 % in it makes 1 % in them",
-        )  # fmt: skip
-
-
-def assumed_totals(context: Context) -> Iterator[Finding]:
-    """A stated total of a lumped mass is taken to sit at the sensors."""
-    yield from taken_at_sensors(context.problem)
-
-
-def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
-    """The assumption of a stated total of a lumped mass, which accelerations cannot contradict."""
-    totals, geometry = problem.formulation.mass.totals, problem.geometry
-    if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts
-        return
-    held = geometry.translational & np.isin(np.arange(geometry.d), geometry.directions[: geometry.n])
-    masses = {f"direction {i + 1}": float(totals.by_direction[i]) for i in np.flatnonzero(held)}
-    if masses:
-        yield Finding(
-            "assumed total", Severity.NOTE,
-            f"all of the stated {', '.join(dict.fromkeys(f'{mass:.5g}' for mass in masses.values()))} kg is taken to "
-            "sit at the sensors. Mass that moves with the table, such as an adapter or a base ring, must not be in it: "
-            "no record can show it, and M, K and C are in proportion to it",
-            numbers=masses,
-        )  # fmt: skip
 
 
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
