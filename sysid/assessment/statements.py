@@ -59,7 +59,7 @@ def statements_of(problem: Prepared, structure: Structure) -> Statements | None:
     entries = np.column_stack([i[once], j[once]])
     std = np.zeros((n, n + d)) if mass.entries_std is None else mass.entries_std
     values, stds = known[i[once], j[once]], std[i[once], j[once]]
-    size = np.sqrt(np.diag(structure.mass))
+    size = np.sqrt(np.maximum(np.diag(structure.mass), 0.0))  # round-off of a base without mass
     size = np.where(size > 0, size, size.max())
     scale = size[entries[:, 0]] * size[entries[:, 1]]
     totals, kind = np.zeros((0, 2), dtype=int), ""

@@ -26,7 +26,7 @@ from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_p
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import sampling_traces, stacked
+from sysid.modal_analysis.response import stacked
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT, ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
@@ -352,7 +352,7 @@ def _of_runs(test: Measurement, records: Records) -> Array:
     weight = factors_of_runs(test.response_std, test.response.shape)[1][records.run, records.line]
     freq, (times, _) = test.freq[records.line], test.whole.pulses(test.freq[-1])
     x = freq / test.freq[-1]
-    traces = np.concatenate([sampling_traces(x), np.exp(2j * np.pi * np.multiply.outer(times, freq))])
+    traces = np.concatenate([[np.ones_like(x), 1j * x, -1j / x], np.exp(2j * np.pi * np.multiply.outer(times, freq))])
     return stacked(np.concatenate([np.where(records.run == run, weight * traces, 0.0) for run in range(test.n_runs)]))
 
 

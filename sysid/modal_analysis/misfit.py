@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, sampling_traces, stacked, weights_of_numbers
+from sysid.modal_analysis.response import columns, stacked, weights_of_numbers
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import EPSILON, beyond_chance
 
@@ -144,7 +144,7 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
 def _fitted(left: ComplexArray, transients: ComplexArray, unit: Array) -> ComplexArray:
     """The part of what is left (c, L) that transients (c, p, L) and traces of each channel explain."""
     _, p, lines = transients.shape
-    traces = stacked(sampling_traces(unit))  # (2 L, 5)
+    traces = stacked(np.stack([np.ones(lines) + 0j, 1j * unit, -1j / unit]))  # (2 L, 3)
     Q = np.linalg.qr(traces)[0]
     size = np.linalg.norm(left, axis=1)
     size[size == 0] = 1.0

@@ -152,7 +152,7 @@ class Parameters:
         Rigid-body mass, kg; zero where no force was measured.
     ends : (m, 2 r)
         alpha, beta of each mode and moving run.
-    traces : (runs, c, 5)
+    traces : (runs, c, 3)
     coupling : (m, m) or None
         rad/s, off the diagonal of ``Phi' C Phi``, of modes that dampers couple; None where damping is classical.
     gains : (k,)

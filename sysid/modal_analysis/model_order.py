@@ -144,44 +144,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     gained = 2 * (more.likelihood - fit.likelihood)
     if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
-    return _in_gauge(_without_spare(_with_poles_above(more, monitor), monitor))
-
-
-def _without_spare(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
-    """The fit without modes within the lines that stood for what modes above them explain now, the poorest first."""
-    least, last = least_worth(fit.model), 2 * np.pi * fit.test.freq[-1]
-    while True:
-        each = np.where(fit.parameters.modes.omega < last, worth(fit), np.inf)
-        poorest = int(np.argmin(each))
-        if each[poorest] >= least:
-            return fit
-        fewer = refitted(fit, _without_one(fit, poorest), monitor=monitor)
-        if not fewer.settled or fit.likelihood - fewer.likelihood >= least:
-            return fit
-        fit = fewer
-
-
-def _without_one(fit: RecordFit, k: int) -> Parameters:
-    """Parameters without the mode k; of two at one pole, which may share a mode in any way, the other has all of it.
-
-    Turned into each other such two make the same response: they are turned until k is as small as can be.
-    """
-    p, gone = fit.parameters, np.arange(fit.model.m) == k
-    poles = p.modes.omega * (1j - p.modes.ratios)
-    near = np.abs(poles - poles[k]) / (p.modes.ratios * p.modes.omega)
-    near[k] = np.inf
-    j = int(np.argmin(near))
-    if near[j] > 1.0:
-        return without(fit, gone)
-    loads = np.hstack([part / (np.abs(part[[j, k]]).max(initial=0.0) or 1.0) for part in (p.modes.gamma, p.ends)])
-    angle = np.pi * np.arange(360) / 360
-    turned = lambda a: np.outer(np.cos(angle), a[k]) - np.outer(np.sin(angle), a[j])  # noqa: E731
-    sizes = np.linalg.norm(turned(p.modes.phi.T), axis=1) * np.linalg.norm(turned(loads), axis=1)
-    c, s = np.cos(angle[np.argmin(sizes)]), np.sin(angle[np.argmin(sizes)])
-    phi, gamma, ends = p.modes.phi.copy(), p.modes.gamma.copy(), p.ends.copy()
-    for part in (phi.T, gamma, ends):
-        part[j] = c * part[j] + s * part[k]
-    return p.with_modes(p.modes._replace(phi=phi, gamma=gamma), ends).at(~gone)
+    return _in_gauge(_with_poles_above(more, monitor))
 
 
 def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:

@@ -23,6 +23,7 @@ from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.noise_levels import bounded_by_lines, floors, likeliest_levels, plain_levels
 from sysid.modal_analysis.record_model import (
+    TRACES,
     HeldShapes,
     NormalEquations,
     Parameters,
@@ -30,7 +31,6 @@ from sysid.modal_analysis.record_model import (
     trace_count,
 )
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import TRACES
 from sysid.modal_analysis.varying_levels import extra_numbers
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF

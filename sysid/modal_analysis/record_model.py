@@ -29,9 +29,11 @@ from sysid.modal_analysis.modal_model import (
     Sums,
     dots,
 )
-from sysid.modal_analysis.response import TRACES, real_times, sampling_traces
+from sysid.modal_analysis.response import real_times
 from sysid.modal_analysis.varying_levels import segments
 from sysid.structure.structure import Array, ComplexArray
+
+TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
 
 
 class RecordModel(SpectralModel):
@@ -109,7 +111,8 @@ class RecordModel(SpectralModel):
     def trace_spectra(self, freq: Array) -> ComplexArray:
         """Spectra of which the traces of a channel are multiples, (traces, L): last those of turned records' ends."""
         unit = freq / self.test.freq[-1]
-        return np.concatenate([sampling_traces(unit), np.exp(2j * np.pi * self.pulses[:, None] * freq)])
+        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
+        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses[:, None] * freq)])
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""

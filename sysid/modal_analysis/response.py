@@ -9,7 +9,6 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import factors_of_runs, separable
 from sysid.structure.structure import Array, ComplexArray, Structure
 
-TRACES = 5  # real numbers a channel and run
 ABOVE = 1.3  # times the last line: a pole there fits what w² leaves of modes beyond, near the last line
 
 
@@ -21,15 +20,6 @@ def columns(record: ComplexArray) -> ComplexArray:
 def stacked(record: ComplexArray) -> Array:
     """Channels (c, rows) as columns, real parts above imaginary ones, (2 rows, c)."""
     return np.vstack([record.real.T, record.imag.T])
-
-
-def sampling_traces(unit: Array) -> ComplexArray:
-    """Spectra of which each channel of a run holds real multiples, (5, L), at lines over the last one, (L,).
-
-    Sampling folds back a series in ``i w``: of 3 samples a period it leaves 4e-4 of a record up to ``i w``, 3e-5 up to
-    its cube, and modes above the lines have ends that such a series is. Drift adds ``1 / (i w)``.
-    """
-    return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit, unit**2 + 0j, 1j * unit**3])
 
 
 def parts_of(record: ComplexArray) -> tuple[ca.DM, ca.DM]:

@@ -29,7 +29,7 @@ from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.results.version import __version__
 
 CONTENT = "sysid identification"
-FORMAT = 6  # rises with every change that an older sysid could not read
+FORMAT = 5  # rises with every change that an older sysid could not read
 FILE_NAME = "result.h5"
 
 _ANEW = "make it anew by 'sysid run PROBLEM'"

@@ -181,8 +181,8 @@ def misfit_of_model(problem: Prepared, structure: Structure, x: Array) -> tuple[
     unit, every = scales_of(formulation.unknowns, x), np.full(x.size, True)
     J = rows.jacobian * unit
     free = left_by_constraints(formulation, x, unit, J, every)
-    own = _by_channels(formulation.own_test, structure)
-    softness, mended, beside = (np.pad(part, ((0, len(J) - len(part)), (0, 0))) for part in own)
+    changes = _by_channels(formulation.own_test, structure)
+    softness, mended, beside = (np.pad(part, ((0, len(J) - len(part)), (0, 0))) for part in changes)
     std, errors = rows.std[:, None], None
     if modal.by_modes:
         errors = gain_errors(modal, structure)
