@@ -41,7 +41,7 @@ def bounded_by_lines(model: RecordModel, levels: Array, beyond: float = 1.1) -> 
         return levels
     both = (np.vstack([run.outputs, run.base]) for run in model.runs)
     most = np.array([quietest(_squares(one) / run.density, 0.1) for one, run in zip(both, model.runs, strict=True)])
-    return np.where(levels > beyond**2 * most, most, levels)
+    return np.where(levels > beyond**2 * most, np.maximum(most, floors(model)), levels)
 
 
 def quietest(power: Array, share: float, size: int = 16) -> Array:

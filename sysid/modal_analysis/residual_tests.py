@@ -222,23 +222,27 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     return B
 
 
-def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
+def uneven(fit: RecordFit, mean: float = 1.0, *, but: float = 0.0) -> bool:
     """True where the power of what is left differs between blocks of lines, and from its mean, by more than chance.
 
-    In all blocks together, or rises above it in one.
+    In all blocks together, or rises above it in one. With `but` that share of the blocks, the loudest, is left out, and
+    the mean is that of the others.
     """
     model, c = fit.model, fit.model.channels
-    off, rare = [], []
+    blocks = list[tuple[float, float]]()  # power and numbers
     powers: list[list[Array]] = [[] for _ in model.runs]
     for chunk in model.chunks(fit.parameters):
         powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
-        for lines in line_blocks(run, fit, 0.0):
-            held, numbers = np.sum(power[lines]) / mean, c * lines.size
-            off.append((held - numbers) / np.sqrt(numbers))
-            rare.append(scipy.special.gammaincc(numbers, held))
-    return bool(np.sum(np.square(off)) > beyond_chance(len(off), 2) or min(rare) < FALSE_ALARM / (2 * len(rare)))
+        blocks += [(float(np.sum(power[lines])), float(c * lines.size)) for lines in line_blocks(run, fit, 0.0)]
+    held, numbers = np.array(blocks).T
+    if but:
+        kept = np.argsort(held / numbers)[: held.size - int(np.ceil(but * held.size))]
+        held, numbers = held[kept], numbers[kept]
+        mean = held.sum() / numbers.sum()
+    off, rare = (held / mean - numbers) / np.sqrt(numbers), scipy.special.gammaincc(numbers, held / mean)
+    return bool(np.sum(off**2) > beyond_chance(off.size, 2) or np.min(rare) < FALSE_ALARM / (2 * off.size))
 
 
 def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, LumpedMass, Problem, Sensor, Structure, simulate
 from sysid.assessment.checks.brackets import Misfit, beside_rigid, softest
 
@@ -210,3 +211,31 @@ class TestAssumptions:
         assert [one["kind"] for one in result.to_dict()["assumptions"]] == self.kinds(result)
         assert result.summary().count("assumed: ") == len(result.assumptions)
         assert sysid.load(result.save(tmp_path)).assumptions == result.assumptions
+
+
+class TestToleranceOfGains:
+    """Gains are off by about a per cent, as stated: what was taken off the records is no error of a part or a model."""
+
+    GAINS = np.array([1.012, 0.99, 1.01, 0.995])
+
+    @pytest.mark.parametrize("rng", [0, 1])
+    def test_no_sensor_of_a_part_is_accused(self, rng):
+        truth, sensors = block()
+        test = shaken(truth, [dataclasses.replace(one, gain_std=0.01) for one in sensors], rng)
+        test = dataclasses.replace(test, response=test.response * self.GAINS[:, None])
+        assert not told(sysid.identify(Problem(test), rng=0))
+
+    @pytest.mark.parametrize("soft", [False, True])
+    def test_beside_a_diagonal_mass_of_whole_records_the_bracket_alone_is_told(self, soft):
+        setting, rng = four_storeys(), np.random.default_rng(0)
+        records, _ = setting.with_noise(setting.run(rng, 60.0).records(), rng)
+        runs = [(records.base, records.response * self.GAINS[:, None], None)]
+        test = sysid.Measurement.from_time(runs, records.sample_rate, rigid_body=np.ones((4, 1)), band=setting.lines)
+        frequency = 4 * setting.structure.natural_frequencies[-1]
+        if soft:
+            test = on_bracket(test, 2, frequency)
+        test = dataclasses.replace(test, gain_std=np.full(4, 0.01))
+        found = told(sysid.identify(Problem(test, mass=LumpedMass(1940.0)), rng=0))
+        assert len(found) == soft
+        for _, value, std in found:
+            assert abs(value - frequency) < max(4 * std, 0.02 * frequency)

@@ -102,7 +102,7 @@ def softest(misfit: Misfit, top: float, least: float = 2e-3, most: float = 1 / 3
     off = lambda rows: rows - U @ (U.T @ rows)  # noqa: E731
     left, softness, mended, wrong = (off(off(rows)) for rows in (*misfit[:3], misfit.others))
     size, products = _size(softness), np.sum(softness * mended, axis=0)
-    seen = size > NEGLIGIBLE * _size(misfit.softness)
+    seen = size > np.maximum(NEGLIGIBLE * _size(misfit.softness), np.finfo(float).tiny)
     along = np.where(seen & (products > 0), -(softness.T @ left) / size, 0.0)
     i, freedom = int(np.argmax(along)), left.size - U.shape[1] - 1
     if freedom < 1 or along[i] <= 0:
@@ -191,7 +191,8 @@ def misfit_of_model(problem: Prepared, structure: Structure, x: Array) -> tuple[
     left, softness, mended, beside = (
         part / std for part in (rows.residuals[:, None], softness, mended, np.hstack([beside, J @ free]))
     )
-    found = Misfit(left[:, 0], softness, mended, beside, np.zeros((len(J), 0)))
+    there = (left[:, 0] != 0) | np.any(beside != 0, axis=1)  # runs of other lengths have no records at some lines
+    found = Misfit(left[there, 0], softness[there], mended[there], beside[there], np.zeros((np.sum(there), 0)))
     return _with_gains(problem, found, errors), unit[:, None] * free
 
 
@@ -221,13 +222,19 @@ def _changes(test: Measurement, structure: Structure) -> list[ComplexArray]:
 
 
 def _with_gains(problem: Prepared, misfit: Misfit, errors: GainErrors | None, usual: float = 0.01) -> Misfit:
-    """The same with what records show of the gains, the first columns of `beside`, and how far off is `usual`."""
-    n = misfit.softness.shape[1]
+    """The same with what records show of the gains, the first columns of `beside`, and how far off is `usual`.
+
+    The records are those from which a calibration has taken errors off: what they show still holds these, and gains
+    that are as usual are off by as much the other way.
+    """
+    n, calibration = misfit.softness.shape[1], problem.modal[0].calibration
     error, std = (np.full(n, np.nan),) * 2 if errors is None else (errors.error, errors.std)
+    taken = np.zeros(n) if calibration is None else calibration.seen(problem.modal[0].records)
+    error = (1 + error) / (1 + taken) - 1
     usually = np.hypot(usual, tolerance_of(problem.stated.measurement)[:n])
     known = np.flatnonzero(np.isfinite(error) & np.isfinite(std) & (std > 0))
     rows = np.vstack([np.eye(n)[known] / std[known, None], np.diag(1 / usually)])
-    values = np.concatenate([error[known] / std[known], np.zeros(n)])
+    values = np.concatenate([error[known] / std[known], (1 / (1 + taken) - 1) / usually])
     none, size = np.zeros((values.size, n)), misfit.left.size + values.size
     rows = np.pad(rows, ((0, 0), (0, misfit.beside.shape[1] - n)))
     others = np.pad(misfit.others, ((0, values.size), (0, 0)))
