@@ -445,10 +445,10 @@ FOUND = [
     ),
     (
         "bracket", "soft bracket",
-        lambda of: f"sensor 2 is on a soft bracket: the higher the frequency, the more it reads than the stated model "
-        f"moves there, if that is right, as on a mounting of {of['frequency']:.4g} Hz (standard deviation "
-        f"{of['std']:.2g} Hz), {100 * of['error']:.2g} % too much at {TRUTH.natural_frequencies[1]:.4g} Hz. M_SS, K_SS "
-        "and C are wrong in its row and column; stiffen its mounting, or leave the sensor out (of a record at hand: "
+        lambda of: f"sensor 2 seems to be on a soft bracket of {of['frequency']:.4g} Hz (standard deviation "
+        f"{of['std']:.2g} Hz): it reads more than the stated model allows, if that is right, the more so the higher "
+        f"the frequency, {100 * of['error']:.2g} % too much at {TRUTH.natural_frequencies[1]:.4g} Hz. M_SS, K_SS and C "
+        "are wrong in its row and column; stiffen its mounting, or leave the sensor out (of a record at hand: "
         f"times 1 - (f / {of['frequency']:.4g} Hz)²)",
     ),
     ("force", "fixed", lambda of: "the measured base force weighs each mode that the base moves"),

@@ -54,14 +54,8 @@ def quietest(power: Array, share: float, size: int = 16) -> Array:
     return np.asarray(np.quantile(held, share, axis=1) / (float(scipy.special.gammaincinv(size, share)) / size))
 
 
-def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns: int) -> Array:
-    """Variances of a sample in time of outputs and base directions, (pieces, c + d), from first ones.
-
-    Parameters
-    ----------
-    unknowns : int
-        Of the fit, which took a part of the noise with it.
-    """
+def likeliest_levels(model: RecordModel, p: Parameters, levels: Array) -> Array:
+    """Variances of a sample in time of outputs and base directions, (pieces, c + d), from first ones."""
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // 8000)))  # more lines tell a level no better than the fit needs
     parts = _parts(thin, p)
@@ -73,7 +67,12 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
         D = _designs(model, number, levels.shape[1])
         rows = list(D)
         found[rows] = _of_run([part for part in parts if part.piece in D], D, levels[rows], least[rows])
-    return found * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
+    return found * _of_noise(model)
+
+
+def _of_noise(model: RecordModel) -> float:
+    """Factor of variances, of which the unknowns of a fit took a part."""
+    return model.numbers / max(model.numbers - model.unknowns, model.numbers / 4)
 
 
 def plain_levels(model: RecordModel, p: Parameters) -> Array:
@@ -82,7 +81,7 @@ def plain_levels(model: RecordModel, p: Parameters) -> Array:
     for chunk in model.chunks(p):
         left += np.sum(_squares(chunk.error), axis=1)
     lines = sum(run.w.size for run in model.runs)
-    beyond = model.numbers / max(model.numbers - model.unknowns, model.numbers / 4) / lines
+    beyond = _of_noise(model) / lines
     density = np.array([run.density for run in model.runs])[:, None]
     for part in (slice(0, model.n), slice(model.n, model.channels)):
         if part.stop > part.start:

@@ -302,7 +302,7 @@ def _fit(
             settled = done
             break
         before = levels
-        levels = plain_levels(model, p) if plain else likeliest_levels(model, p, levels, model.unknowns)
+        levels = plain_levels(model, p) if plain else likeliest_levels(model, p, levels)
         if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
             settled = True
             break

@@ -146,7 +146,7 @@ def _levels_alone(fit: RecordFit, varying: NDArray[np.bool_]) -> RecordFit:
     assert fit.test.whole is not None
     trial = replace(fit, test=replace(fit.test, whole=replace(fit.test.whole, varying=varying)))
     levels = fit.levels_of_runs[[run.number for run in trial.model.runs]]
-    return replace(trial, levels=likeliest_levels(trial.model, fit.parameters, levels, fit.model.unknowns))
+    return replace(trial, levels=likeliest_levels(trial.model, fit.parameters, levels))
 
 
 def varying_levels(fit: RecordFit) -> tuple[VaryingLevel, ...]:

@@ -83,11 +83,10 @@ def _tree(source: Path) -> Tree:
     )
     tree, number = from_bytes(image)
     version, content, this = tree.get("sysid_version"), tree.get("content"), f"this one reads format {FORMAT}"
-    code = "in which expressions could hold code"
     refuse(
         (number > FORMAT, f"it has format {number} (sysid {version}), and {this}: a later sysid is needed"),
         (content != CONTENT, f"it holds a {content}, not a {CONTENT}"),
-        (number < FORMAT, f"it has format {number}, of an earlier sysid, {code}, and {this}; {_ANEW}"),
+        (number < FORMAT, f"it has format {number}, of an earlier sysid, and {this}; {_ANEW}"),
     )
     return tree
 

@@ -82,7 +82,7 @@ def soft_brackets(context: Context, largest: int = 400) -> Iterator[Finding]:
     elif end.x is not None and problem.formulation.fits_records and end.structure.mode_shapes.size <= largest:
         found = _beside_model(problem, end.structure, end.x, top)
         if found is not None and _is_known(problem, end.structure, end.x):
-            yield _finding(context, found, "the stated model moves there, if that is right")
+            yield _finding(context, found, "the stated model allows, if that is right")
 
 
 def _highest(context: Context) -> float:
@@ -136,8 +136,8 @@ def _finding(context: Context, found: SoftBracket, against: str) -> Finding:
     numbers = {"frequency": frequency, "std": std, "deviations": found.deviations, "error": high, "sensor": float(i)}
     return Finding(
         "soft bracket", context.weight,
-        f"{which} is on a soft bracket: the higher the frequency, the more it reads than {against}, as on a mounting "
-        f"of {frequency:.4g} Hz (standard deviation {std:.2g} Hz), {100 * high:.2g} % too much at {top:.4g} Hz. M_SS, "
+        f"{which} seems to be on a soft bracket of {frequency:.4g} Hz (standard deviation {std:.2g} Hz): it reads more "
+        f"than {against}, the more so the higher the frequency, {100 * high:.2g} % too much at {top:.4g} Hz. M_SS, "
         "K_SS and C are wrong in its row and column",
         f"stiffen its mounting, or leave the sensor out (of a record at hand: times 1 - (f / {frequency:.4g} Hz)²)",
         channel=None if found.others else names[i],

@@ -63,9 +63,9 @@ def least_squares(context: Context) -> Iterator[Finding]:
             which = "the records" if len(context.fits) == 1 else f"the records of test {i}"
             yield Finding(
                 "least squares", context.weight,
-                f"no modes with noise in all channels explain {which}: they left more than least squares do, which "
-                f"were fitted instead, with the motion of the base as recorded ({100 * left:.3g} % missed, 100 % by a "
-                "rigid body)",
+                f"no modal model explains {which}, even with noise in every channel: the modes were fitted by least "
+                f"squares instead, with the recorded motion of the base taken as exact ({100 * left:.3g} % of the "
+                "response is missed; a rigid body misses 100 %)",
                 "look for what moves the structure beside the recorded base (another support, a load), and for parts "
                 "that yield, slip or rattle", numbers={"test": float(i), "residual": left},
             )  # fmt: skip
