@@ -206,7 +206,8 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     run.add_argument(
         "--at-rest", action="store_true", default=None,
-        help="of TEST.h5: all records begin and end at rest, or were tapered to it, and have no transients",
+        help="of TEST.h5: all records begin and end at rest, as they were recorded without a window, and have no "
+        "transients",
     )  # fmt: skip
 
 
@@ -276,7 +277,8 @@ def _add_read(command: Adder) -> None:
         "--join",
         action="store_true",
         default=None,
-        help="a file a sensor: the files of a folder are one run; columns are called FILE, or FILE.COLUMN of several",
+        help="each file has one sensor: the files of a folder, or those that share the rest of their names (run1_top, "
+        "run1_table), are one run; columns are called FILE, or FILE.COLUMN of several",
     )
     read.add_argument(
         "--align",

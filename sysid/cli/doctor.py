@@ -98,7 +98,7 @@ def _look(names: list[str], out: Output) -> int:
     for one in recordings_of(files, said):
         kind, channels, rate = kind_of(one, base), channels_of(one), ""
         if one.freq is None:
-            with _told(missing):
+            with _collecting(missing):
                 rate = f" at {recorded_rate(one, said):g} Hz"
         out.write(
             f"{one.path}: {one.columns[0].values.size} {'samples' if one.freq is None else 'lines'}{rate}, {kind}\n"
@@ -108,7 +108,7 @@ def _look(names: list[str], out: Output) -> int:
         out.write("".join(f"  {remark}\n" for remark in one.remarks))
         missing += coarse_lines(one)
         runs.append({"file": str(one.path), "kind": kind, "channels": [column.name for column in channels]})
-    with _told(missing):
+    with _collecting(missing):
         gather(files, said)
     out.answer(runs=runs, missing=missing)
     out.write("".join(f"missing: {one}\n" for one in dict.fromkeys(missing)) or "'sysid read' takes them as they are\n")
@@ -116,7 +116,7 @@ def _look(names: list[str], out: Output) -> int:
 
 
 @contextlib.contextmanager
-def _told(missing: list[str]) -> Iterator[None]:
+def _collecting(missing: list[str]) -> Iterator[None]:
     """Add what is refused within to what is missing."""
     try:
         yield

@@ -17,8 +17,9 @@ from sysid.files.alignment import UnitColumns, clock_moves
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
-from sysid.measurement.spectra import on_one_clock
-from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_motion, sensor_row
+from sysid.measurement.spectra import TimeRun, on_one_clock
+from sysid.measurement.whole import tapered
+from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
 _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
@@ -51,13 +52,14 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
         remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
         parts = list(zip(said.channels, records, strict=True))
         runs.append(run_of(parts, said, axes, str(recording.path)))
-        remarks += base_differences(parts, said, axes, str(recording.path))
+        moving = [(channel, record - record.mean()) for channel, record in parts]  # an offset is no motion
+        remarks += base_differences(moving, said, axes, str(recording.path))
     if max(rates) - min(rates) > 1e-6 * max(rates):
         raise InputError(
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
             f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
         )
-    remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0])), *_rests(runs)]
+    remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0])), *_ends(runs, said, axes)]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks),
         **tolerances_of(said, axes),
@@ -70,12 +72,25 @@ def delays_in_words(said: Description) -> list[str]:
     return [f"{one.column} is {1e3 * one.delay:.6g} ms late as stated; that is taken off" for one in late]
 
 
-def _rests(runs: Sequence[Run]) -> list[str]:
-    """A remark where all records begin and end at rest: hardly move in their first and last samples, few of many."""
+def _ends(runs: Sequence[Run], said: Description, axes: Sequence[str]) -> list[str]:
+    """A remark where a window seems to lie over a run, else where all records begin and end at rest.
+
+    At rest: they hardly move in their first and last hundredth, in which short fades move still.
+    """
+    G = rigid_body(sensors=sensors_of(said), base_axes=axes, origin=said.origin)
+    words = "a window seems to have been laid over the records, which are then no motion of the structure"
+    if any(tapered(_without_padding(TimeRun(*run)), G) for run in runs):
+        return [f"{words}; export them without it"]
     records = [row for run in runs for part in run if part is not None for row in part]
-    ends = [np.delete(row, slice(n, -n)) for row in records if (n := max(row.size // 500, 5))]
-    words = "the records begin and end at rest, or were tapered to it: 'sysid run --at-rest' takes them so"
-    return [words] * all(np.std(end) < 0.01 * np.std(row) for end, row in zip(ends, records, strict=True))
+    ends = [np.delete(row, slice(n, -n)) for row in records if (n := max(row.size // 100, 5))]
+    still = all(np.std(end) < 0.01 * np.std(row) for end, row in zip(ends, records, strict=True))
+    return ["the records begin and end at rest: 'sysid run --at-rest' takes them so"] * still
+
+
+def _without_padding(run: TimeRun) -> TimeRun:
+    """The run without the samples at its ends where all channels are zero, as windows leave them too."""
+    moves = np.flatnonzero(np.any(np.vstack([run.base, run.outputs]), axis=0))
+    return TimeRun(*(None if part is None else part[:, moves[0] : moves[-1] + 1] for part in run))  # type: ignore[arg-type]
 
 
 def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
@@ -275,7 +290,7 @@ def base_differences(
 ) -> list[str]:
     """Readings of more sensors of the base than it has directions, as shares of the motion that is taken for it.
 
-    Refused are such that have less than half in common.
+    Records are without their means. Refused are such that have less than half in common.
     """
     base = [part for part in parts if part[0].role == "base"]
     if len(base) <= len(axes):
@@ -353,9 +368,9 @@ def joined(recordings: Sequence[Recording], said: Description) -> list[Recording
     files of other times or rates, or longer than others by more than a hundredth, unless their clocks are aligned.
     """
     runs, every = [], runs_of_files(list(dict.fromkeys(one.path for one in recordings)), said)
-    described = [part for one in said.channels for part in (str(one.column), str(one.column).partition(".")[0])]
+    columns = [part for one in said.channels for part in (str(one.column), str(one.column).partition(".")[0])]
     for names in every:
-        lost = [one for other in every for one in other.values() if one in described and one not in names.values()]
+        lost = [one for other in every for one in other.values() if one in columns and one not in names.values()]
         words = f"its run has no file of {', '.join(map(repr, dict.fromkeys(lost)))}, as another has: name it too"
         refuse((lost, f"{next(iter(names))}: {words}"))
         held = [[one for one in recordings if one.path == file] for file in names]
@@ -413,15 +428,13 @@ def _begins(
     empty = [str(recording.path) for recording, part in zip(recordings, parts, strict=True) if not part]
     refuse((empty, f"{', '.join(empty)}: no column is described, so that it cannot be aligned (--align): leave it out"))
     longest = max(part[0].values.size for part in parts)
-    words = (
-        f"{recordings[0].path}: the files of its folder have rates of {min(rates):g} to {max(rates):g} Hz: bring them"
-    )
+    words = f"{recordings[0].path}: the files of its run have rates of {min(rates):g} to {max(rates):g} Hz: bring them"
     refuse((longest * (max(rates) / min(rates) - 1) > 0.5, f"{words} to one with sysid.resample"))
     offsets, remarks = clock_moves(clocks, said)
     begun = np.array([clock.begin for clock in clocks]) + offsets
     begins = np.rint((begun.max() - begun) * rates[0]).astype(int)
     left = min(part[0].values.size - begin for part, begin in zip(parts, begins, strict=True))
-    refuse((left < 3, f"{recordings[0].path}: the files of its folder have no time in common on one clock"))
+    refuse((left < 3, f"{recordings[0].path}: the files of its run have no time in common on one clock"))
     return begins, remarks
 
 

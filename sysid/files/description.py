@@ -71,7 +71,7 @@ class Description:
     frf, convention : str
         Of frequency responses, see `sysid.files.responses`; "" where they are to be recognised.
     join : bool
-        Whether the files of a folder hold the sensors of one run, instead of a run each.
+        Whether files hold one sensor each, those of a folder or with the same rest of their names being one run.
     align : bool
         Whether the files of a run have clocks of their own, which are brought to that of the base.
     """

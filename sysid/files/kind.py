@@ -13,6 +13,8 @@ from sysid.structure.structure import Array
 def kind_of(recording: Recording, base: Sequence[str] = ()) -> str:
     """Kind of test in words: by the columns of the base where they are known, else by what most columns show."""
     columns = [one for one in channels_of(recording) if not base or one.name in base] or channels_of(recording)
+    if recording.freq is not None and recording.freq.size < 2:
+        return "too short to tell"
     if recording.freq is not None:
         what = "functions" if any(np.any(np.imag(one.values)) for one in columns) else "magnitudes alone"
         even = np.ptp(np.diff(recording.freq)) < 0.01 * np.mean(np.diff(recording.freq))
@@ -44,7 +46,7 @@ def coarse_lines(recording: Recording) -> list[str]:
     for one in channels_of(recording) if recording.freq is not None else []:
         size, steps = np.abs(one.values), np.abs(np.diff(one.values))
         # Real numbers are coherences or magnitudes; spectra of random motion differ from line to line.
-        if not np.any(np.imag(one.values)) or np.median(steps) > 0.5 * np.median(size):
+        if size.size < 2 or not np.any(np.imag(one.values)) or np.median(steps) > 0.5 * np.median(size):
             continue
         low, at = np.flatnonzero(~(size > np.max(size) / np.sqrt(2))), int(np.argmax(size))
         counts.append(int(min(low[low > at], default=size.size) - max(low[low < at], default=-1) - 1))

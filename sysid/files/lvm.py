@@ -53,9 +53,10 @@ def read_lvm(path: Path) -> list[Recording]:
     form = Form(separator, comma=separator != ",")
     rows = [row for row in _without_special(lines, form, path) if any(row[1])]
     ends = [at for at, (_, row) in enumerate(rows) if row[0] == _ENDS]
-    refuse((len(ends) < 2, f"{path} is cut short: it has {len(ends)} lines {_ENDS}, and two are needed at least"))
+    words = f"it has {len(ends)} lines {_ENDS}, and two are needed at least; export it again"
+    refuse((len(ends) < 2, f"{path} is cut short: {words}"))
     several = any(row[:2] == ["X_Columns", "Multi"] for _, row in rows[: ends[0]])
-    parts, ended = [list[tuple[int, list[str]]]()], False
+    parts, ended = [Rows()], False
     for number, row in rows[ends[0] + 1 :]:
         if ended and row[0] in _TAGS:
             parts.append([])
@@ -73,14 +74,16 @@ def _without_special(lines: Sequence[str], form: Form, path: Path) -> Iterator[t
         if not inside:
             yield number, row
         inside *= row[0] != "***End_Special***"
-    refuse((inside, f"{path}, line {inside}: the special block that begins there does not end: it is cut short"))
+    words = "the special block that begins there does not end: it is cut short; export it again"
+    refuse((inside, f"{path}, line {inside}: {words}"))
 
 
 def _segment(rows: Rows, form: Form, several: bool, path: Path) -> _Segment:
     """A segment of its header, the names of its columns, and its table."""
     place = f"{path}, line {rows[0][0]}" if rows else str(path)
     end = next((at for at, (_, row) in enumerate(rows) if row[0] == _ENDS), len(rows))
-    refuse((len(rows) < end + 3, f"{place}: the segment that begins there has no table: it is cut short"))
+    words = "the segment that begins there has no table: it is cut short; export it again"
+    refuse((len(rows) < end + 3, f"{place}: {words}"))
     head, labels = {row[0]: row for _, row in rows[:end]}, rows[end + 1][1]
 
     def stated(tag: str, at: int) -> str:
@@ -88,7 +91,8 @@ def _segment(rows: Rows, form: Form, several: bool, path: Path) -> _Segment:
 
     def number(tag: str, at: int) -> float:
         found = form.numbers([stated(tag, at) or "0"])
-        refuse((found is None, f"{place}: {tag} of its header is {shown(stated(tag, at))}, which is no number"))
+        words = f"{tag} of its header is {shown(stated(tag, at))}, which is no number: is it damaged? Export it again"
+        refuse((found is None, f"{place}: {words}"))
         return float(np.real((found or [0.0])[0]))
 
     # Behind the names stand that of comments, and separators.
@@ -100,10 +104,10 @@ def _segment(rows: Rows, form: Form, several: bool, path: Path) -> _Segment:
     table, lines = table_of(body, form, width, path).real, np.array([line for line, _ in body])
     first = max(channels, key=lambda at: number("Samples", at))  # its x-values are those that stand there
     words = f"its header states {number('Samples', first):g} samples, and {len(body)} are there: it is cut short"
-    dimension = stated("X_Dimension", first) or "Time"
+    dimension, needed = stated("X_Dimension", first) or "Time", "time or frequency is needed: export that"
     refuse(
         (len(body) < number("Samples", first), f"{place}: {words}; export it again"),
-        (dimension not in ("Time", "Frequency"), f"{place}: its x-values are {shown(dimension)}: time is needed"),
+        (dimension not in ("Time", "Frequency"), f"{place}: its x-values are {shown(dimension)}: {needed}"),
     )
     step, x = number("Delta_X", first), table[:, (first - 1) * several]
     if dimension == "Frequency":

@@ -45,9 +45,9 @@ def read_strong_motion(path: Path) -> list[Recording]:
     """
     lines = text_of(path).splitlines()
     ends = [at for at, line in enumerate(lines) if _END.search(line)]
-    kind = "corrected accelerations of the CSMIP format, Volume 2 (.V2): is it Volume 1, or of another format?"
+    kind = "corrected accelerations of the CSMIP format, Volume 2 (.V2): is it Volume 1, or of another format? Download"
     starts = [at for at, line in enumerate(lines) if _START.match(line)]
-    refuse((not starts, f"{path} holds no {kind}"))
+    refuse((not starts, f"{path} holds no {kind} the processed file"))
     cut = not ends or starts[-1] > ends[-1]
     refuse((cut, f"{path} is cut short: its last channel does not end; download it again"))
     parts = zip([0, *(at + 1 for at in ends)], ends, strict=False)
@@ -55,7 +55,8 @@ def read_strong_motion(path: Path) -> list[Recording]:
     steps, lengths = {one.step for one in found}, {one.column.values.size for one in found}
     apart = f"{path}: its channels have intervals of {', '.join(f'{one:g}' for one in steps)} s and lengths of "
     apart += f"{', '.join(map(str, lengths))} samples: write those of one recorder to a file of their own"
-    refuse((min(steps) <= 0, f"{path} states an interval of {min(steps):g} s"), (len(steps) * len(lengths) > 1, apart))
+    damaged = f"{path} states an interval of {min(steps):g} s: is it damaged? Download it again"
+    refuse((min(steps) <= 0, damaged), (len(steps) * len(lengths) > 1, apart))
     return [Recording(path, tuple(one.column for one in found), 1 / steps.pop(), remarks=tuple(_remarks(found)))]
 
 
@@ -64,7 +65,8 @@ def _channel(lines: Sequence[str], begin: int, end: int, number: int, path: Path
     starts = [at for at in range(begin, end) if _START.match(lines[at])]
     match = _START.match(lines[starts[0]]) if starts else None
     if match is None or match[2].lower() != "accel":
-        raise InputError(f"{path}, line {begin + 1}: channel {number} of the file has no accelerations")
+        words = f"channel {number} of the file has no accelerations: download the processed file (Volume 2)"
+        raise InputError(f"{path}, line {begin + 1}: {words}")
     text = list(lines[begin : starts[0]])
     named = next(filter(None, map(_CHANNEL.match, [*text, f"Chan {number}: "])))
     name, words = f"Chan {int(named[1])}", " ".join(named[2].split())

@@ -43,6 +43,11 @@ def test_functions_of_too_few_lines_at_their_peak_are_told_so(tmp_path, capsys, 
     assert sum("finer lines" in one for one in found["missing"]) == coarse
 
 
+def test_one_line_of_spectra_is_too_short_to_tell(tmp_path, capsys):
+    (tmp_path / "h.csv").write_text("freq [Hz],top_re,top_im\n5.0,1.0,0.1\n")
+    assert told(capsys, str(tmp_path / "h.csv"))["runs"][0]["kind"] == "too short to tell"
+
+
 def test_what_is_missing_is_told_until_nothing_is(tmp_path, capsys):
     path = tmp_path / "run.npz"
     np.savez(path, table=NOISE[0], top=NOISE[1])

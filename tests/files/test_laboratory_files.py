@@ -1,10 +1,14 @@
 """Files of LabVIEW, of the CESMD and of MATLAB as laboratories have them, and several runs of joined exports."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.io import savemat
+from scipy.signal.windows import tukey
 
 import sysid
+from benchmarks.records.simulated import four_storeys
 from sysid.cli import main as cli
 from sysid.files import reading, units
 
@@ -148,26 +152,74 @@ def test_base_sensors_of_one_axis_are_told_by_their_differences(tmp_path):
         reading.gather(tmp_path / "turned.npz", said)
 
 
+@pytest.mark.parametrize("offset, other, refused", [(3.0, A - 3.0, False), (9.8, 9.8 - A, True)])
+def test_offsets_of_base_sensors_are_no_motion(tmp_path, offset, other, refused):
+    """The same motion with offsets of either sign agrees; opposite motions differ, gravity on both or not."""
+    np.savez(tmp_path / "run.npz", a=A + offset, c=other, b=B, fs=50.0)
+    said = sensors(unit="m/s²")
+    said["sensor"].append({**said["sensor"][0], "column": "c"})
+    if refused:
+        with pytest.raises(sysid.InputError, match="share less than half"):
+            reading.gather(tmp_path / "run.npz", said)
+    else:
+        test = reading.gather(tmp_path / "run.npz", said)
+        np.testing.assert_allclose(test.runs[0][0][0], A, atol=1e-12)
+        assert sum("'a' 1 times" in one and "'c' 1 times" in one for one in test.remarks) == 1
+
+
 @pytest.mark.parametrize("text", ["cm/sec2", "CM/SEC/SEC", "cm/s/s", "cm/sec^2", "gal"])
 def test_units_of_strong_motion_files_are_known(text):
     assert units.find(text) == units.Unit("acceleration", 1e-2)
 
 
-@pytest.mark.parametrize("tapered", [True, False])
-def test_records_at_rest_at_both_ends_are_told_and_run_so(tmp_path, monkeypatch, capsys, no_pictures, tapered):
-    monkeypatch.chdir(tmp_path)
-    truth = sysid.Structure([[2.0, 0.0], [0.0, 0.0]], [[3e3, -3e3], [-3e3, 3e3]], [0.03], n_base=1)
-    base = np.random.default_rng(2).standard_normal((1, 800))
-    window = np.interp(np.arange(800), [0, 15, 60, 740, 785, 799], [0, 0, 1, 1, 0, 0]) if tapered else 1.0
-    top = truth.simulate(base, 50.0) * window
-    savemat(
-        "run.mat", {"a": base * window, "b": top + 1e-3 * np.random.default_rng(3).standard_normal((1, 800)) * window}
-    )
-    toml = [f'[[sensor]]\ncolumn = "{name}"\nrole = "{role}"\naxis = "x"\nunit = "g"\n' for name, role in
-            (("a", "base"), ("b", "response"))]  # fmt: skip
-    (tmp_path / "run.toml").write_text("sample_rate = 50.0\n" + "".join(toml))
-    assert cli.main(["read", "run.mat"]) == 0
-    assert ("--at-rest" in capsys.readouterr().out) == tapered
-    if tapered:
-        assert cli.main(["run", "test.h5", "--at-rest", "--out", "out"]) in (0, 1)
-        assert sysid.load("out").recipe.parameters["at_rest"] is True
+FLOORS = four_storeys()
+WAYS = {
+    "in motion": lambda records: records,
+    "tapered": lambda records: records * tukey(records.shape[1], 0.1),
+    "tapered and padded": lambda records: np.pad(records * tukey(records.shape[1], 0.1), ((0, 0), (20, 20))),
+}
+
+
+def written(folder, records):
+    """A file of base and floors at 200 Hz, and what is said of them."""
+    names = ["table", "a1", "a2", "a3", "a4"]
+    np.savez(folder / "run.npz", fs=FLOORS.sample_rate, **dict(zip(names, records, strict=True)))
+    said = [{"column": name, "role": "response", "axis": "x", "unit": "m/s²"} for name in names]
+    return {"sensor": [said[0] | {"role": "base"}, *said[1:]]}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_window_over_the_records_is_told_and_not_taken_for_rest(tmp_path, way, seed):
+    rng = np.random.default_rng(seed)
+    run = FLOORS.with_noise(FLOORS.run(rng).records(), rng)[0]
+    said = written(tmp_path, WAYS[way](np.vstack([run.base, run.response])))
+    remarks = " ".join(reading.gather(tmp_path / "run.npz", said).remarks)
+    assert "--at-rest" not in remarks
+    assert ("window" in remarks) == (way != "in motion")
+
+
+@pytest.mark.parametrize("quiet", [5.0, 0.0])
+def test_records_from_rest_to_rest_are_told_and_run_so(tmp_path, monkeypatch, no_pictures, quiet):
+    """A shake of 20 s from `quiet` on, and free decay; noise of 0.3 %."""
+    rng, time = np.random.default_rng(2), np.arange(12000) / FLOORS.sample_rate
+    base = rng.standard_normal((1, 12000)) * np.where((time >= quiet) & (time < quiet + 20), 1.0, 0.0)
+    records = np.vstack([base, FLOORS.structure.simulate(base, FLOORS.sample_rate)])
+    records += 3e-3 * np.std(records, axis=1, keepdims=True) * rng.standard_normal(records.shape)
+    said = written(tmp_path, records)
+    remarks = " ".join(reading.gather(tmp_path / "run.npz", said).remarks)
+    assert ("--at-rest" in remarks) == (quiet > 0)
+    assert "window" not in remarks
+    if quiet:
+        monkeypatch.chdir(tmp_path)
+        Path("run.toml").write_text(
+            "".join("[[sensor]]\n" + "".join(f'{k} = "{v}"\n' for k, v in one.items()) for one in said["sensor"]),
+            encoding="utf-8",
+        )
+        assert cli.main(["read", "run.npz"]) == 0
+        assert cli.main(["run", "test.h5", "--at-rest", "--out", "out"]) == 0
+        result = sysid.load("out")
+        assert result.recipe.parameters["at_rest"] is True
+        np.testing.assert_allclose(
+            result.structure.natural_frequencies, FLOORS.structure.natural_frequencies, rtol=1e-4
+        )
