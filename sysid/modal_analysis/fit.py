@@ -105,7 +105,7 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
     """
     left, whole = left_of(fit), fit.model.whole
     sound = fit.stopped or whole.noise is not None or left < much or at_few_lines(fit.test)
-    if sound or not uneven(fit, but=0.03):  # a tone or a spike is no wrong model
+    if sound or (left < 1.0 and not uneven(fit, but=0.03)):  # a tone or a spike is no wrong model
         return fit
     monitor.doing = "least squares"
     plain = replace(fit, test=replace(fit.test, whole=replace(whole, varying=None, plain=True)))
@@ -115,8 +115,7 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
             squares = min((squares, *_anew(plain, monitor)), key=left_of)
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
-    better = squares.settled and left > worse * left_of(squares)
-    return squares if better and not runs_in_motion(fit) else fit
+    return squares if left > worse * left_of(squares) and not runs_in_motion(fit) else fit
 
 
 def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
