@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sysid.assessment.checks.brackets import beside_rigid
+from sysid.assessment.checks.brackets import parts_with_spare
 from sysid.finding import Finding, Severity
 from sysid.measurement.gains import tolerance_of
 from sysid.models.mass import LumpedMass
@@ -76,9 +76,8 @@ def _mountings(problem: Prepared) -> Iterator[Finding]:
     test = problem.measurement
     if not problem.formulation.mass.free:
         return
-    parts = np.array([sensor.part for sensor in test.sensors or ()] or [""] * test.n_sensors)
-    spare = {part for part in set(parts) - {""} if len(beside_rigid(test, parts == part))}
-    count = sum(part not in spare for part in parts)
+    spare = parts_with_spare(test)
+    count = test.n_sensors - sum(int(np.sum(mine)) for mine, _ in spare.values())
     if count:
         which = "the sensors" if not spare else f"{count} of {test.n_sensors} sensors"
         yield Finding(

@@ -19,7 +19,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.gains import GainErrors, gain_errors
+from sysid.assessment.checks.gains import GainErrors, gain_errors, less
 from sysid.assessment.sensitivity import KNOWN, largest_deviations, left_by_constraints, rows_of
 from sysid.errors import InputError, listed
 from sysid.finding import Finding
@@ -99,8 +99,7 @@ def softest(misfit: Misfit, top: float, least: float = 2e-3, most: float = 1 / 3
     """
     U, s, _ = np.linalg.svd(misfit.beside / _size(misfit.beside), full_matrices=False)
     U = U[:, s > ROUND_OFF * s.max(initial=0.0)]
-    off = lambda rows: rows - U @ (U.T @ rows)  # noqa: E731
-    left, softness, mended, wrong = (off(off(rows)) for rows in (*misfit[:3], misfit.others))
+    left, softness, mended, wrong = (less(U, rows) for rows in (*misfit[:3], misfit.others))
     size, products = _size(softness), np.sum(softness * mended, axis=0)
     seen = size > np.maximum(NEGLIGIBLE * _size(misfit.softness), np.finfo(float).tiny)
     along = np.where(seen & (products > 0), -(softness.T @ left) / size, 0.0)
@@ -247,15 +246,15 @@ def _with_gains(problem: Prepared, misfit: Misfit, errors: GainErrors | None, us
 def misfits_of_parts(problem: Prepared, structure: Structure) -> Iterator[tuple[str, Misfit]]:
     """Each rigid part with sensors to spare, and by how far these do not move as a rigid body, line by line."""
     test, unknowns = problem.measurement, structure.mode_shapes.size
-    parts = [sensor.part for sensor in test.sensors or ()]
-    for part in dict.fromkeys(filter(None, parts)):
-        mine = np.array([one == part for one in parts])
-        sums = beside_rigid(test, mine)
-        if not len(sums):
-            continue
-        noise, inside = noise_records(test, structure, unknowns)[0], np.concatenate(test.own_lines)
-        std = _shared(noise, test, unknowns) * np.sqrt(sums**2 @ noise.std[:, inside] ** 2 / 2)  # of a real number
-        changes = _changes(test, structure)
+    parts = parts_with_spare(test)
+    if not parts:
+        return
+    noise, inside = noise_records(test, structure, unknowns)[0], np.concatenate(test.own_lines)
+    shared, changes, errors = (
+        _shared(noise, test, unknowns), _changes(test, structure), gain_errors(problem.modal[0], structure)
+    )  # fmt: skip
+    for part, (mine, sums) in parts.items():
+        std = shared * np.sqrt(sums**2 @ noise.std[:, inside] ** 2 / 2)  # of a real number
         # A sensor that is not where it is said to be reads a rotation of the part besides.
         turns = np.linalg.pinv(_rigid_rows(test, mine), NEGLIGIBLE)[3:] @ changes[2][mine]
         far = np.linalg.norm(turns, axis=1) > NEGLIGIBLE * np.linalg.norm(changes[2][mine])
@@ -267,7 +266,7 @@ def misfits_of_parts(problem: Prepared, structure: Structure) -> Iterator[tuple[
         left, softness, mended, gains, delays, *turned = (np.concatenate([one.real, one.imag]) for one in every)
         others = np.hstack([np.zeros((len(left), 0)), *turned])
         found = Misfit(left.sum(axis=1), -softness, -mended, -np.hstack([gains, delays]), others)
-        yield part, _with_gains(problem, found, gain_errors(problem.modal[0], structure))
+        yield part, _with_gains(problem, found, errors)
 
 
 def _shared(noise: Record, test: Measurement, unknowns: int) -> float:
@@ -284,6 +283,14 @@ def _rigid_rows(test: Measurement, mine: NDArray[np.bool_]) -> Array:
     rows = rigid_body(sensors=sensors, base_axes=BASE_AXES, origin=tuple(centre.tolist()))
     rows[:, 3:] /= max(float(np.abs(places - centre).max()), np.finfo(float).tiny)
     return rows
+
+
+def parts_with_spare(test: Measurement) -> dict[str, tuple[NDArray[np.bool_], Array]]:
+    """Rigid parts with more sensors than their motion needs: which these are, (n_sensors,), and `beside_rigid`."""
+    parts = [sensor.part for sensor in test.sensors or ()]
+    masks = {part: np.array([one == part for one in parts]) for part in dict.fromkeys(filter(None, parts))}
+    every = {part: (mine, beside_rigid(test, mine)) for part, mine in masks.items()}
+    return {part: (mine, sums) for part, (mine, sums) in every.items() if len(sums)}
 
 
 def beside_rigid(test: Measurement, mine: NDArray[np.bool_]) -> Array:

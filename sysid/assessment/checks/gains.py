@@ -305,8 +305,8 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     """
     each = records.data.shape[1] // test.n_sensors
     by_sensor = lambda x: np.sum(x, axis=-2).reshape(*x.shape[:-2], each, test.n_sensors).sum(axis=-2)  # noqa: E731
-    rigid, beside = _rigid_motion(test, records), _less(Q, free.left)
-    extra, slopes = _less(Q, ones), _less(Q, slopes)
+    rigid, beside = _rigid_motion(test, records), less(Q, free.left)
+    extra, slopes = less(Q, ones), less(Q, slopes)
     column = extra @ rigid
     size = by_sensor(column**2)
     observable = size > MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
@@ -338,7 +338,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     return np.where(observable, np.array([error, std, least]), np.nan)
 
 
-def _less(Q: Array, columns: Array) -> Array:
+def less(Q: Array, columns: Array) -> Array:
     """Columns less their part along orthonormal ones, twice, as the first time leaves round-off of what it takes."""
     columns = columns - Q @ (Q.T @ columns)
     return columns - Q @ (Q.T @ columns)
