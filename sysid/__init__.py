@@ -34,6 +34,7 @@ from sysid.search.strategy import History
 from sysid.search.swarm import Swarm
 from sysid.structure.sensor import rigid_body
 from sysid.structure.structure import Structure
+from sysid.structure.amplitude import AmplitudeLaw, FittedLaw
 from sysid.structure.superelement import ResidualModes
 from sysid.swarm import SwarmSettings, minimize_swarm
 
@@ -66,6 +67,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "AmplitudeLaw", "FittedLaw",
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",

@@ -23,11 +23,11 @@ Kind = Literal[
     "stated value", "in motion", "one mode twice", "coarse lines", "misfit", "force misfit", "rigid motion", "damping",
     "one motion", "own term", "no solution",
     # What leaves the matrices open.
-    "not judged", "other answers", "open", "noise", "modes not all tried",
+    "not judged", "other answers", "open", "noise", "modes not all tried", "amplitude open",
     # What is to be known besides.
     "fixed", "strategy", "search", "ending", "on a bound", "search box", "level", "lines left out",
     "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio",
-    "gain not shown", "noise not judged", "modes below",
+    "gain not shown", "noise not judged", "modes below", "amplitude law", "linear",
     # What an answer takes for granted.
     "assumed total", "assumed mass", "assumed gain", "assumed force gain", "assumed mounting", "assumed base",
 ]  # fmt: skip

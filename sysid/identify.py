@@ -122,6 +122,7 @@ def prepare(problem: Prepared, session: Session) -> None:
     try:
         with session.fit_monitor() as monitor:
             problem.modal = fit_tests(zip(problem.stated.tests, problem.delays, strict=True), monitor)
+            problem.follow_amplitude(monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()
         problem.prepare(session.preparing)

@@ -114,11 +114,16 @@ def is_test(name: str | None) -> bool:
 
 def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
-    said = {name: getattr(options, name) for name in ("lumped", "mass", "band", "goal", "gain_std", "at_rest")}
+    names = ("lumped", "mass", "band", "goal", "gain_std", "at_rest", "amplitude")
+    said = {name: getattr(options, name) for name in names}
     extra = {name: value for name, value in said.items() if value is not None}
     if not is_test(given.module):
         refuse(
-            (extra, "--mass, --lumped, --band, --gain-std, --at-rest and --goal are for a test that 'sysid read' wrote")
+            (
+                extra,
+                "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for a test that "
+                "'sysid read' wrote",
+            )
         )
         return given
     refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, Stop
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
@@ -58,6 +59,7 @@ from sysid.modal_analysis.rough_poles import (
 from sysid.modal_analysis.spectra_modes import strongest_poles
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
+from sysid.structure.amplitude import AmplitudeLaw
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -368,6 +370,24 @@ def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMo
     return tuple(found)
 
 
+def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw, monitor: FitMonitor) -> ModalEstimate:
+    """The estimate of whole records with laws of the stated modes, which are its modes' where one of them is certain.
+
+    Raises
+    ------
+    InputError
+        Where there is no such mode.
+    """
+    fit = modal.record_fit
+    assert fit is not None
+    with one_thread():
+        found = with_laws(fit, stated, left_of, monitor=monitor)
+        laws = fitted_laws(found)
+        if found.stopped or any(law.is_certain for law in laws):
+            return estimate(found, modal.calibration)
+    return replace(modal, laws=laws)
+
+
 def without_transients(fit: RecordFit) -> Measurement:
     """The records as they would be at rest at both ends, with their noise stated."""
     test, model, p = fit.test, fit.model, fit.parameters
@@ -404,6 +424,6 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         excess_of(fit), varying_levels(fit), runs_in_motion(fit),
         () if fit.model.whole.plain else unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
-        delays=delays_of(fit), calibration=calibration,
+        delays=delays_of(fit), calibration=calibration, laws=fitted_laws(fit),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
+from sysid.modal_analysis.law_spectra import without_laws
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, stacked, weights_of_numbers
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -114,8 +115,9 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     Changes of displacement q and velocity v over a run make ``Z^-1 (f + i w g)`` of the degrees of freedom, with Z the
     dynamic stiffness, ``f = K v`` and ``g = K q + C v``: two real numbers a degree of freedom and run, whatever the
     damping. Traces of sampling and detrending are real multiples of 1, i w and 1 / (i w) a channel and run,
-    also of one at rest at both ends.
+    also of one at rest at both ends. What laws of the amplitude add is taken off first.
     """
+    test = without_laws(test, structure)
     if test.whole is None:
         return test
     n = structure.n

@@ -18,6 +18,7 @@ from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import columns, coupled_flexibility, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, round_off
 
@@ -149,6 +150,9 @@ class ModalEstimate:
         Taken off sensors and force; None where none were asked for.
     calibration : Calibration or None
         Errors of gains that were taken off, and what tolerances leave of them; None where all gains are exact.
+    laws : tuple of FittedLaw
+        Of modes that follow their amplitude, where this was asked for. Where none of them is certain the modes are
+        those without.
     """
 
     given: Measurement
@@ -176,6 +180,7 @@ class ModalEstimate:
     coupling: Coupling | None = None
     delays: Delays | None = None
     calibration: Calibration | None = None
+    laws: tuple[FittedLaw, ...] = ()
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:

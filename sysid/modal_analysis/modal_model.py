@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import coupled_flexibility, gains, modes_above, motion_and_slopes, real_times
+from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array, ComplexArray
 
 FAR = 30.0  # logarithms of frequencies and damping ratios: no step of use leads beyond
@@ -141,6 +142,15 @@ class Moves(NamedTuple):
     loads: ComplexArray
 
 
+class ModeLaw(NamedTuple):
+    """A mode that follows its amplitude at a sensor, both by number, the form of its law and the law's numbers."""
+
+    mode: int
+    sensor: int
+    form: LawForm
+    values: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """All that is fitted to whole records, beside the levels of the noise.
@@ -157,6 +167,8 @@ class Parameters:
         rad/s, off the diagonal of ``Phi' C Phi``, of modes that dampers couple; None where damping is classical.
     gains : (k,)
         Errors of gains within their tolerances, in units of these; empty where none are stated.
+    laws : tuple of ModeLaw
+        Of modes that follow their amplitude.
     """
 
     modes: Modes
@@ -165,11 +177,14 @@ class Parameters:
     traces: Array
     coupling: Array | None = None
     gains: Array = field(default_factory=lambda: np.zeros(0))
+    laws: tuple[ModeLaw, ...] = ()
 
     def at(self, kept: NDArray[Any]) -> Parameters:
         """Those of some of the modes, by flags (m,) or numbers."""
         coupling = None if self.coupling is None else self.coupling[np.ix_(kept, kept)]
-        return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling)
+        numbers = np.arange(len(self.ends))[kept].tolist()
+        laws = tuple(law._replace(mode=numbers.index(law.mode)) for law in self.laws if law.mode in numbers)
+        return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling, laws=laws)
 
     def with_modes(self, modes: Modes, ends: Array) -> Parameters:
         """The same with further modes behind its own, which no damper couples to these; `modes` and `ends` are all."""
@@ -187,7 +202,11 @@ class SpectralModel:
         Sensors, base directions, modes; sensors and, where a force was measured, its directions.
     kept : int
         How many of the unknowns of `Index` there are: without a force the rigid-body mass is left out.
+    laws : tuple of ModeLaw
+        Of modes that follow their amplitude.
     """
+
+    laws: tuple[ModeLaw, ...] = ()
 
     def __init__(self, test: Measurement, m: int, runs: list[Run]) -> None:
         self.test, self.m, self.runs = test, m, runs

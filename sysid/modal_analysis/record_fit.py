@@ -21,6 +21,7 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
+from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.noise_levels import bounded_by_lines, floors, likeliest_levels, plain_levels
 from sysid.modal_analysis.record_model import (
     TRACES,
@@ -32,6 +33,7 @@ from sysid.modal_analysis.record_model import (
 )
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.varying_levels import extra_numbers
+from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -90,7 +92,7 @@ class RecordFit:
     def model_of(self, p: Parameters, test: Measurement | None = None, *, gains: bool = False) -> RecordModel:
         """The model of other parameters, or of another test: of these where none is given."""
         coupled, m = p.coupling is not None, p.modes.omega.size
-        return RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled)
+        return RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled, laws=p.laws)
 
     @cached_property
     def asked(self) -> RecordModel:
@@ -175,7 +177,8 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": self.model.whole.plain,
+            "gains": p.gains, "plain": self.model.whole.plain, 
+            "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
 
     @classmethod
@@ -191,7 +194,11 @@ class RecordFit:
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
-        p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains)
+        laws = tuple(
+            ModeLaw(law["mode"], law["sensor"], LawForm(*law["form"].tolist()), law["values"])
+            for law in tree.get("laws") or ()
+        )
+        p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
         fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains]
@@ -202,6 +209,8 @@ class RecordFit:
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
+        sound &= all(law.mode in range(m) and law.sensor in range(model.n) for law in laws)
+        sound &= all(law.values.shape == (law.form.size,) and bool(np.all(np.isfinite(law.values))) for law in laws)
         sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))
         return fit
@@ -249,7 +258,7 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
     Poles that leave the records unexplained are not looked for far away: a few steps are taken.
     """
     m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
-    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, trace_count(test))))
+    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, trace_count(test))), laws=())
     model = HeldShapes(test, m, poles=held, static=fit.static, coupled=first.coupling is not None)
     return _fit(model, first, None, FitMonitor(), _POLES)
 
@@ -346,7 +355,8 @@ class _Equations:
 
     def __call__(self, p: Parameters, levels: Array, near: float = 0.2) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
-        if self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
+        still = self.at is not None and not self.model.laws  # of laws a gradient takes as long as the matrix
+        if still and self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))

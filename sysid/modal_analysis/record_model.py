@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.gains import read_by_gains
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.law_spectra import Addition, LawMotions
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
     FAR,
     Columns,
     Layer,
     Lines,
+    ModeLaw,
     Moves,
     NormalEquations,
     Parameters,
@@ -59,10 +62,12 @@ class RecordModel(SpectralModel):
     """
 
     def __init__(
-        self, test: Measurement, m: int, *, gains: bool = False, static: int = 0, coupled: bool = False
-    ) -> None:
+        self, test: Measurement, m: int, *, gains: bool = False, static: int = 0, coupled: bool = False,
+        laws: tuple[ModeLaw, ...] = (),
+    ) -> None:  # fmt: skip
         assert test.whole is not None
-        self.whole = test.whole
+        self.whole, self.laws = test.whole, laws
+        self.law_motions = LawMotions(test) if laws else None
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         runs = [
             Run(
@@ -92,7 +97,9 @@ class RecordModel(SpectralModel):
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
         self.coupling = slice(before, before + len(self.coupled))
-        self.of_gains = slice(self.coupling.stop, self.coupling.stop + self.by_gains.shape[2])
+        numbers = sum(law.form.size for law in self.laws)
+        self.of_laws = slice(self.coupling.stop, self.coupling.stop + numbers)
+        self.of_gains = slice(self.of_laws.stop, self.of_laws.stop + self.by_gains.shape[2])
         self.n_fit = self.of_gains.stop
         self.gains = gains
         self.delays = self.n_fit + 3 * self.n * self.d  # where they begin
@@ -141,7 +148,8 @@ class RecordModel(SpectralModel):
         rigid = np.array([p.rigid[i, j] for i, j in index.pairs]) if self.force else np.zeros(0)
         coupling = np.zeros(len(self.coupled)) if p.coupling is None else p.coupling[*self.coupled.T]
         of_gains = p.gains if p.gains.size else np.zeros(self.by_gains.shape[2])
-        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling, of_gains])
+        laws = [law.values for law in p.laws]
+        return np.concatenate([theta, rigid, p.ends.ravel(), p.traces.ravel(), coupling, *laws, of_gains])
 
     def unpack(self, x: Array) -> Parameters:
         """The inverse of `pack`."""
@@ -159,7 +167,11 @@ class RecordModel(SpectralModel):
             coupling = np.zeros((self.m, self.m))
             coupling[*self.coupled.T] = x[self.coupling]
             coupling = coupling + coupling.T if self.force else coupling
-        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape), coupling, x[self.of_gains])
+        cuts = np.cumsum([law.form.size for law in self.laws])[:-1]
+        numbers = np.split(x[self.of_laws], cuts)
+        laws = tuple(law._replace(values=values) for law, values in zip(self.laws, numbers, strict=False))
+        traces = traces.reshape(shape)
+        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces, coupling, x[self.of_gains], laws)
 
     def moved(self, x: Array, step: Array, most: float = 1.0) -> Array:
         """Unknowns after a step, to first order their sum: a mode's scale, shape against load, changes by a factor.
@@ -201,6 +213,8 @@ class RecordModel(SpectralModel):
 
     def chunk(self, p: Parameters, run: Run) -> Chunk:
         """Some lines at given parameters."""
+        if p.laws:
+            return LawChunk(self, p, run)
         return Chunk(self, p, run) if p.coupling is None else CoupledChunk(self, p, run)
 
     def normal_equations(self, p: Parameters, levels: Array) -> NormalEquations:
@@ -269,8 +283,8 @@ class Chunk(Lines):
     """Some lines of one run at given parameters, with the columns of their Jacobian."""
 
     def __init__(self, model: RecordModel, p: Parameters, run: Run) -> None:
-        super().__init__(model, p, run)
         self.records = model
+        super().__init__(model, p, run)
 
     def columns(self) -> Columns:
         """Columns of all channels by the spectra."""
@@ -384,6 +398,55 @@ class Chunk(Lines):
     def products(self, levels: Array, columns: Columns) -> NormalEquations:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
         return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
+
+
+class LawChunk(Chunk):
+    """The same with modes that follow their amplitude: to motions and columns comes what their laws add."""
+
+    @cached_property
+    def added(self) -> list[Addition]:
+        """What each law adds."""
+        model, p = self.records, self.p
+        assert model.law_motions is not None
+        return [model.law_motions.added(p, self.run, law) for law in range(len(p.laws))]
+
+    def motion_of(self, base: ComplexArray) -> ComplexArray:
+        """See `Lines`."""
+        motion = super().motion_of(base)
+        for law, added in zip(self.p.laws, self.added, strict=True):
+            motion[law.mode] += added.motion
+        return motion
+
+    def spectra(self, base: ComplexArray) -> ComplexArray:
+        """See `Chunk`; last, law by law, come derivatives by the logarithm of the size of the shape, and by the law."""
+        plain, m, d = super().spectra(base), self.records.m, self.records.d
+        first = np.cumsum([0, m, m * d, m, m, d])  # of q, by gamma, by log omega, by log zeta, u; then ends
+        last = []
+        for law, added in zip(self.p.laws, self.added, strict=True):
+            k = law.mode
+            plain[k] += added.motion
+            plain[first[1] + k * d : first[1] + (k + 1) * d] += added.by_gamma
+            plain[first[2] + k] += added.by_omega
+            plain[first[3] + k] += added.by_ratio
+            if self.at_ends is not None:
+                plain[first[5] + 2 * k : first[5] + 2 * k + 2] += added.by_ends
+            last += [added.by_size[None], added.by_law]
+        return np.concatenate([plain, *last])
+
+    def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """See `Chunk`."""
+        yield from super().entries(channel)
+        model, p = self.records, self.p
+        d = model.d
+        at = 3 * model.m + model.m * d + d + len(self.trace_spectra) + (2 * d + model.channels) * model.gains
+        at += 0 if self.at_ends is None else 2 * model.m
+        own = model.of_laws.start
+        for law in self.p.laws:
+            size, shape = law.form.size, self.shapes[channel, law.mode]
+            of_size = model.index.phi.start + law.sensor * model.m + law.mode
+            yield np.array([of_size]), np.array([at]), np.array([shape / p.modes.phi[law.sensor, law.mode]])
+            yield own + np.arange(size), at + 1 + np.arange(size), np.full(size, shape)
+            own, at = own + size, at + 1 + size
 
 
 class CoupledChunk(Chunk):

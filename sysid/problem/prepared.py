@@ -18,7 +18,7 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
-from sysid.modal_analysis.fit import estimate, fit_modes
+from sysid.modal_analysis.fit import estimate, fit_modes, follow_amplitude
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
@@ -35,6 +35,7 @@ from sysid.problem.feasible import HELD, check_constraints, scale_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, geometry_of, rough_mass
 from sysid.problem.stated import StatedProblem
+from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array, Structure
 from sysid.swarm import box
 
@@ -243,6 +244,18 @@ class Prepared(SearchSpace):
             more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
             self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
+
+    def follow_amplitude(self, monitor: FitMonitor) -> None:
+        """Fit the laws that are asked for to the problem's own whole records."""
+        if self.stated.amplitude is not None:
+            monitor.begin(1)
+            modal = follow_amplitude(self.modal[0], self.stated.amplitude, monitor)
+            self.modal = (modal, *self.modal[1:])
+
+    @property
+    def laws(self) -> tuple[FittedLaw, ...]:
+        """Of the modes that follow their amplitude beyond chance."""
+        return tuple(law for law in self.modal[0].laws if law.is_certain)
 
     @property
     def answers_in_band(self) -> bool:

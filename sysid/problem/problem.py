@@ -15,6 +15,7 @@ from sysid.problem import stored
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared, SearchSpace
 from sysid.problem.stated import StatedProblem
+from sysid.structure.amplitude import AmplitudeLaw
 from sysid.structure.structure import Array, Structure
 
 
@@ -71,6 +72,8 @@ class Problem(StatedProblem, SearchSpace):
     residual_modes : bool
         Fit what modes above the lines add to each test beside a model that has none of them, as one of fewer elements
         than the structure: `Structure.residual`. With a mass and a stiffness that are free they come by themselves.
+    amplitude : AmplitudeLaw, optional
+        Modes whose frequency and damping follow their own amplitude, in whole records: `Structure.laws`.
 
     Attributes
     ----------
@@ -107,6 +110,7 @@ class Problem(StatedProblem, SearchSpace):
             goal=tree["goal"],
             loss=tree["loss"],
             residual_modes=tree.get("residual_modes", False),  # results of before have none
+            amplitude=tree.get("amplitude") and AmplitudeLaw.from_tree(tree["amplitude"]),
         )
         vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:

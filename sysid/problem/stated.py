@@ -22,6 +22,7 @@ from sysid.problem import stored
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, as_models, geometry_of
 from sysid.problem.terms import FurtherTest
+from sysid.structure.amplitude import AmplitudeLaw
 from sysid.structure.structure import Array, Structure
 
 
@@ -47,6 +48,7 @@ class StatedProblem:
     goal: float | None = field(default=None, kw_only=True)
     loss: Literal["squares", "huber"] = field(default="squares", kw_only=True)
     residual_modes: bool = field(default=False, kw_only=True)
+    amplitude: AmplitudeLaw | None = field(default=None, kw_only=True)
     site: str = field(init=False, default="?")
 
     def __post_init__(self) -> None:
@@ -57,13 +59,20 @@ class StatedProblem:
             as_float("Problem: goal", self.goal, "a positive relative residual", above=0)
         choice("Problem: loss", self.loss, ("squares", "huber"))
         flag("Problem: residual_modes", self.residual_modes)
-        own = self.misfit is not None
+        if self.amplitude is not None:
+            instance("Problem: amplitude", self.amplitude, AmplitudeLaw)
+        own, whole = self.misfit is not None, self.measurement.whole is not None
         refuse(
             (
                 own and self.loss == "huber",
                 "Problem: loss='huber' is of records, and this problem fits a misfit of its own",
             ),
             (own and self.residual_modes, "Problem: residual_modes=True is of records, not of a misfit of one's own"),
+            (
+                self.amplitude is not None and (own or not whole),
+                "Problem: amplitude is of modes of whole records (Measurement.from_time, estimator='records'), and "
+                + ("this problem fits a misfit of its own" if own else "this test holds spectra"),
+            ),
         )
         if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
             raise InputError("Problem: healing is a dictionary from variables to expressions: {m: 9 * m / ca.sum1(m)}")
@@ -128,6 +137,7 @@ class StatedProblem:
             "goal": self.goal,
             "loss": self.loss,
             "residual_modes": self.residual_modes,
+            "amplitude": self.amplitude and self.amplitude.to_tree(),
         }
 
     @cached_property

@@ -26,6 +26,7 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.calibration import calibrated
 from sysid.modal_analysis.delays import Clock
 from sysid.modal_analysis.fit import estimate, fit_modes
+from sysid.modal_analysis.law_spectra import added_by_laws
 from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, screened
@@ -333,8 +334,11 @@ class Answer:
         return self.fitted.records.force_residual(self.structure)
 
     def predict(self, measurement: Measurement) -> ComplexArray:
-        """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
-        return measurement.predict(self.structure)
+        """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq).
+
+        Modes that follow their amplitude do so from rest, which needs lines of records (`Measurement.from_time`).
+        """
+        return measurement.predict(self.structure) + added_by_laws(measurement, self.structure)[0]
 
     @cached_property
     def uncertainty(self) -> Uncertainty:

@@ -48,6 +48,7 @@ class Verdict(NamedTuple):
 
 def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
+    end = replace(end, structure=end.structure.with_laws(prepared.laws))
     context = Context(prepared, end, session.cut_short)
     verdict = verdict_of(context)
     session.log(f"done: {verdict.message}")
@@ -69,7 +70,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
         found = [*closed, *found]
     strategy, ending = Finding("strategy", Severity.NOTE, why), Finding("ending", Severity.NOTE, end.message)
     it = Identification(
-        structure=end.structure,
+        structure=end.structure.with_laws(prepared.laws),
         problem=problem,
         prepared=prepared,
         x=end.x,

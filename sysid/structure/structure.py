@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, whole_number
+from sysid.structure.amplitude import FittedLaw, in_time, laws_from_tree, laws_to_tree
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
 from sysid.structure.superelement import CraigBampton, ResidualModes, modal_gains
@@ -54,6 +55,9 @@ class Structure:
         Descriptions of the sensors, for tables and figures.
     residual : ResidualModes, optional
         What answers in the band with the structure's own modes; none by default.
+    laws : sequence of FittedLaw, optional
+        Of modes that follow their own amplitude. Mass, stiffness, damping, modes and responses to spectra are those at
+        rest; `simulate` and `simulate_force` follow the laws, and `at_level` gives the structure at a level.
 
     Attributes
     ----------
@@ -114,7 +118,9 @@ class Structure:
         recovery: ArrayLike | None = None,
         sensors: Sequence[Any] | None = None,
         residual: ResidualModes | None = None,
+        laws: Sequence[FittedLaw] = (),
     ) -> None:
+        self.laws = tuple(laws)
         self.mass = _symmetric("mass", mass, "n + d")
         self.stiffness = _symmetric("stiffness", stiffness, "n + d")
         if self.mass.shape != self.stiffness.shape:
@@ -164,6 +170,36 @@ class Structure:
         other._set_residual(residual)
         return other
 
+    def with_laws(self, laws: Sequence[FittedLaw]) -> Structure:
+        """The same structure with modes that follow their amplitude."""
+        other = copy(self)
+        other.laws = tuple(laws)
+        return other
+
+    def mode_of(self, law: FittedLaw) -> int:
+        """Index of the mode that a law is of: the nearest in frequency."""
+        return int(np.argmin(np.abs(np.log(self.natural_frequencies / law.frequency))))
+
+    def at_level(self, level: float) -> Structure:
+        """The linear structure that moves as this one does where its modes with a law move at a level, m/s².
+
+        ``K(A) = K - (w0² - w(A)²) M phi phi' M`` and likewise C: the mass stays. Modes without a law stay too.
+        """
+        level = as_float("level", level, "m/s², >= 0", at_least=0)
+        K, C, n = self.stiffness.copy(), self.damping.copy(), self.n
+        rigid = np.hstack([np.eye(n), -self.rigid_body_dofs])  # of relative motion
+        for law in self.laws:
+            k = self.mode_of(law)
+            # What the law says at rest is near the mode's own; the change is what counts.
+            rest, there = law.at(0.0), law.at(level)
+            w = self._omega[k] * np.array([1.0, there[0] / rest[0]])
+            zeta = self.damping_ratios[k] + np.array([0.0, there[1] - rest[1]])
+            row = self.normal_modes[:, k] @ self.mass[:n, :n]
+            K += (w[1] ** 2 - w[0] ** 2) * np.outer(row @ rigid, row @ rigid)
+            C += 2 * (zeta[1] * w[1] - zeta[0] * w[0]) * np.outer(row, row)
+        tree = {**self.to_tree(), "laws": None, "stiffness": K, "damping_ratios": None, "damping_matrix": C}
+        return Structure.from_tree(tree)
+
     def to_tree(self) -> dict[str, Any]:
         """Arguments of the constructor as a dictionary of numbers and arrays, for `from_tree`."""
         return {
@@ -173,6 +209,7 @@ class Structure:
             "damping_matrix": None if self.modal_damping else self.damping,
             "n_base": self.n_base, "recovery": self.recovery, "rigid_body": self.rigid_body,
             "sensors": sensors_to_tree(self.sensors), "residual": vars(self.residual) if self.residual.count else None,
+            "laws": laws_to_tree(self.laws),
         }  # fmt: skip
 
     @classmethod
@@ -180,7 +217,8 @@ class Structure:
         """Structure from a dictionary that `to_tree` made, exact to the bit."""
         beyond = tree.get("residual")  # structures of before have none
         residual = None if beyond is None else ResidualModes(**beyond)
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual})
+        laws = laws_from_tree(tree.get("laws"))
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual, "laws": laws})
 
     @property
     def n_sensors(self) -> int:
@@ -350,7 +388,13 @@ class Structure:
         state = np.zeros((2, self.n + self.residual.count))
         if initial is not None:
             state[:, : self.n] = shaped_array("initial", initial, 2, self.n)
-        return motion, modal_accelerations(self._modal_model, motion, rate, state)
+        modal = modal_accelerations(self._modal_model, motion, rate, state)
+        for law in self.laws:
+            k = self.mode_of(law)
+            numbers = np.log([self._omega[k], self.damping_ratios[k], abs(self.mode_shapes[law.sensor, k])])
+            load = self.participation[k] @ motion
+            modal[k] = in_time(law, np.concatenate([numbers, law.values]), load, rate, state[:, k])
+        return motion, modal
 
     def to_state_space(self) -> StateSpace:
         """Continuous-time state space from base accelerations to absolute sensor accelerations.

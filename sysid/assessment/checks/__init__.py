@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from sysid.assessment.checks import (
     against_records,
+    amplitude,
     brackets,
     damaged_samples,
     gains,
@@ -25,6 +26,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
+    amplitude.laws_of_amplitude,
     brackets.soft_brackets,
     stated.stated_masses,
     search_end.missed_goal,

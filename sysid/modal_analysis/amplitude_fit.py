@@ -1,0 +1,163 @@
+"""Laws by which modes follow their amplitude, fitted to whole records with all else: exponents by likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.errors import InputError, Stop
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_fit import modes_within
+from sysid.modal_analysis.modal_model import ModeLaw
+from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.residues import line_correlation
+from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm, motion
+from sysid.structure.structure import ComplexArray
+from sysid.structure.thresholds import EPSILON, ROUND_OFF
+
+
+def with_laws(
+    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], *, monitor: FitMonitor,
+    much: float = 0.1, tries: tuple[float, ...] = (0.0, 0.03),
+) -> RecordFit:  # fmt: skip
+    """The fit with laws of the stated modes, numbered from 1 by frequency within the lines.
+
+    Where the linear model misses `much`, by what `left_of` gives, what it misses passes for noise of the base, which
+    then explains any law: squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these
+    falls of the frequency at the highest level.
+
+    Raises
+    ------
+    InputError
+        Where there is no such mode, or dampers couple the modes.
+    """
+    try:
+        with monitor.at_work():
+            return _with_laws(fit, stated, left_of, monitor, much, tries)
+    except (Stop, KeyboardInterrupt):
+        best = monitor.best
+        return replace(best if isinstance(best, RecordFit) else fit, stopped=True)
+
+
+def _with_laws(
+    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], monitor: FitMonitor, much: float,
+    tries: tuple[float, ...],
+) -> RecordFit:  # fmt: skip
+    p, whole = fit.parameters, fit.model.whole
+    plain = left_of(fit) > much or whole.plain
+    whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
+    linear = replace(fit, test=replace(fit.test, whole=whole), parameters=replace(p, coupling=None))
+    if plain or p.coupling is not None:
+        monitor.doing = "least squares"
+        linear = refitted(linear, linear.parameters, monitor=monitor)
+    monitor.keep_instead(linear)
+    own = _modes_of(linear, stated)
+    best = None
+    for exponents in _exponents(stated):
+        monitor.doing = f"a law of amplitude, exponents {exponents[0]:g} and {exponents[1]:g}"
+        found = _begun(linear, own, exponents, tries, monitor) if best is None else _other(best, exponents, monitor)
+        if best is None or found.likelihood > best.likelihood:
+            best = found
+            monitor.keep_instead(best)
+    assert best is not None
+    if plain and not fit.model.whole.plain and left_of(best) < much:
+        monitor.doing = "noise of all channels"
+        best = refitted(replace(best, test=fit.test, levels=fit.levels), best.parameters, monitor=monitor)
+        monitor.keep_instead(best)
+    return best
+
+
+def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
+    """Numbers of the stated modes among those of a fit."""
+    omega = fit.parameters.modes.omega
+    inside = np.flatnonzero(modes_within(omega, 2 * np.pi * fit.test.freq[[0, -1]], np.zeros(0)))
+    order = inside[np.argsort(omega[inside], kind="stable")]
+    if max(stated.modes) > order.size:
+        raise InputError(
+            f"AmplitudeLaw: mode {max(stated.modes)} is to follow its amplitude, and the records show {order.size} "
+            "modes within their lines: state the number of one of these"
+        )
+    return [int(order[mode - 1]) for mode in stated.modes]
+
+
+def _exponents(stated: AmplitudeLaw) -> Iterator[tuple[float, float]]:
+    if stated.exponents != "auto":
+        yield stated.exponents
+        return
+    for of_frequency in OF_FREQUENCY:
+        for of_damping in OF_DAMPING:
+            yield of_frequency, of_damping
+
+
+def _begun(
+    linear: RecordFit, own: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
+) -> RecordFit:
+    """Laws of these exponents, from the better of some falls of the frequency."""
+    p = linear.parameters
+    found = []
+    for fall in tries:
+        laws = []
+        for k in own:
+            sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
+            form = LawForm(*exponents, _levels(linear, k, sensor)[1])
+            laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0])))
+        modes = p.modes._replace(omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), own), 1 + fall / 2, 1))
+        found.append(refitted(linear, replace(p, modes=modes, laws=tuple(laws)), limits=ROUGH, monitor=monitor))
+    best = max(found, key=lambda one: one.likelihood)
+    return refitted(best, best.parameters, monitor=monitor)
+
+
+def _other(fit: RecordFit, exponents: tuple[float, float], monitor: FitMonitor) -> RecordFit:
+    """Laws of other exponents, from what these say at the highest level and half of it."""
+    laws = tuple(law._replace(form=law.form._replace(of_frequency=exponents[0], of_damping=exponents[1])) for law in fit.parameters.laws)
+    return refitted(fit, replace(fit.parameters, laws=laws), monitor=monitor)
+
+
+def _white_errors(fit: RecordFit) -> ComplexArray:
+    """What the fit leaves of each output in units of its noise, (channels, runs, n_freq)."""
+    test, model = fit.test, fit.model
+    left = np.zeros((model.channels, test.n_runs, test.freq.size), complex)
+    for chunk in model.chunks(fit.parameters):
+        at = np.searchsorted(test.freq, chunk.run.w / (2 * np.pi) * (1 - EPSILON))
+        left[:, chunk.run.number, at] = chunk.deviations(fit.levels)[0][:, None] * chunk.error
+    return left
+
+
+def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tuple[float, float]:
+    """Level that a mode exceeds but for a `share` of the time, and its highest, m/s²: of the linear mode."""
+    whole, parts = fit.model.whole, []
+    for number, (samples, own) in enumerate(zip(whole.samples, fit.test.own_lines, strict=True)):
+        spectrum = np.zeros(samples, complex)
+        freq = fit.test.freq[own]
+        for chunk in fit.model.chunks(fit.parameters):
+            if chunk.run.number == number:
+                at = np.round(chunk.run.w / (2 * np.pi) * samples / whole.sample_rate).astype(int)
+                spectrum[at] = 2 * chunk.motion[mode]  # analytic: its modulus is the envelope
+        parts.append(np.abs(np.fft.ifft(spectrum)) * whole.sample_rate)
+    level = np.concatenate(parts) * abs(fit.parameters.modes.phi[sensor, mode])
+    return float(np.quantile(level, share)), float(level.max())
+
+
+def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
+    """The laws of a fit, with the covariance of frequency, damping and law, as wide as what is left says."""
+    model, p, found = fit.model, fit.parameters, []
+    if not p.laws:
+        return ()
+    N, size = unit_diagonal(fit.normal[: model.n_fit, : model.n_fit])
+    half = half_inverse(N, ROUND_OFF)
+    widened = max(fit.reduced, 1.0) * line_correlation(_white_errors(fit), model.unknowns)
+    covariance = half @ half.T / np.outer(size, size) / 2 * widened
+    first = model.of_laws.start
+    for law in p.laws:
+        at = [model.index.log_omega.start + law.mode, model.index.log_ratios.start + law.mode, *range(first, first + law.form.size)]
+        first += law.form.size
+        omega, ratio = float(p.modes.omega[law.mode]), float(p.modes.ratios[law.mode])
+        found.append(
+            FittedLaw(
+                omega / (2 * np.pi), ratio, law.sensor, law.form, law.values, _levels(fit, law.mode, law.sensor),
+                covariance[np.ix_(at, at)],
+            )
+        )  # fmt: skip
+    return tuple(found)

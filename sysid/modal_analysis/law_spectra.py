@@ -1,0 +1,167 @@
+"""Modes whose frequency and damping follow their amplitude, as a term of the model of whole records.
+
+Such a mode moves as its law says under the base as it was recorded, from a first state that the two numbers of its ends
+are; noise of the base moves it as the linear mode of the same frequency and damping. So its motion is that of the
+linear mode and what the law adds, and so is every derivative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_model import ModeLaw, Parameters, Run
+from sysid.modal_analysis.response import gains_and_slopes
+from sysid.structure.amplitude import motion
+from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import EPSILON
+
+
+@dataclass(frozen=True, eq=False)
+class Addition:
+    """What a law adds to the motion of its linear mode at the lines of a run, and derivatives of it.
+
+    Attributes
+    ----------
+    motion : (L,)
+    by_ends : (2, L)
+    by_gamma : (d, L)
+    by_omega, by_ratio, by_size : (L,)
+        By logarithms.
+    by_law : (k, L)
+    """
+
+    motion: ComplexArray
+    by_ends: ComplexArray
+    by_gamma: ComplexArray
+    by_omega: ComplexArray
+    by_ratio: ComplexArray
+    by_size: ComplexArray
+    by_law: ComplexArray
+
+    def at(self, lines: NDArray[np.intp]) -> Addition:
+        """Some of its lines."""
+        return Addition(*(part[..., lines] for part in vars(self).values()))
+
+
+class LawMotions:
+    """Motions of the modes that follow a law, of all runs of a test, and what they add to the linear ones.
+
+    Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for.
+    """
+
+    def __init__(self, test: Measurement, per_period: float = 24.0) -> None:
+        self.per_period = per_period
+        self.rate, self.samples, self.at_rest = _clock_of(test)
+        self.lines, self.base = [], []
+        for base, own in zip(test.base, test.own_lines, strict=True):
+            self.lines.append(test.freq[own])
+            self.base.append(base[:, own])
+        self._series: dict[tuple[int, int], tuple[int, Array]] = {}
+        self._last: tuple[Parameters | None, dict[tuple[int, int], Addition]] = (None, {})
+
+    def places(self, run: int) -> NDArray[np.intp]:
+        """Numbers of the lines of a run among all of its Fourier transform."""
+        return np.round(self.lines[run] * self.samples[run] / self.rate).astype(int)
+
+    def in_time(self, run: int, mode: int, omega: float) -> tuple[int, Array]:
+        """Motion of the base (d, n) whose straight lines from step to step have the run's lines; steps a sample."""
+        if (run, mode) not in self._series:
+            times = int(np.ceil(self.per_period * omega / (2 * np.pi) / self.rate))
+            fine = self.samples[run] * times
+            spectrum = np.zeros((len(self.base[run]), fine // 2 + 1), complex)
+            straight = np.sinc(self.lines[run] / (self.rate * times)) ** 2
+            spectrum[:, self.places(run)] = self.base[run] / straight * self.rate * times
+            self._series[run, mode] = times, np.fft.irfft(spectrum, fine)
+        return self._series[run, mode]
+
+    def added(self, p: Parameters, run: Run, law: int) -> Addition:
+        """What a law adds at the lines of a part of a run."""
+        part = np.searchsorted(self.lines[run.number], run.w / (2 * np.pi) * (1 - EPSILON))
+        return self.of_run(p, run.number, law).at(part)
+
+    def of_run(self, p: Parameters, run: int, law: int) -> Addition:
+        """What a law adds at all lines of a run; that of the last parameters is kept."""
+        if self._last[0] is not p:
+            self._last = (p, {})
+        found = self._last[1]
+        if (run, law) not in found:
+            found[run, law] = self._added(p, run, p.laws[law])
+        return found[run, law]
+
+    def _added(self, p: Parameters, run: int, law: ModeLaw) -> Addition:
+        modes, k = p.modes, law.mode
+        times, series = self.in_time(run, k, float(modes.omega[k]))
+        d, moving = len(series), [at for at, rest in enumerate(self.at_rest) if not rest]
+        ends = np.zeros(2)
+        if run in moving:
+            ends = p.ends[k, 2 * moving.index(run) : 2 * moving.index(run) + 2]
+        gamma, omega, ratio = modes.gamma[k], modes.omega[k], modes.ratios[k]
+        numbers = np.concatenate([np.log([omega, ratio, abs(modes.phi[law.sensor, k])]), law.values])
+        step = 1 / (self.rate * times)
+        rows = motion(law.form, gamma @ series, step, numbers, ends[::-1], series)
+        spectra = np.fft.rfft(rows[:, ::times])[:, self.places(run)] / self.rate
+        w, base = 2 * np.pi * self.lines[run], self.base[run]
+        g, slopes = gains_and_slopes(self.lines[run], modes.omega[[k]], modes.ratios[[k]])
+        by_omega, by_ratio = slopes.reshape(2, -1)
+        transients = np.stack([1 / w**2, 1j / w])
+        if run not in moving:
+            transients = transients * 0
+        load = gamma @ base + ends @ transients
+        here = spectra[0] - gamma @ base
+        by_ends = np.stack([spectra[2], spectra[1]]) * (run in moving)
+        return Addition(
+            here - g[0] * load, by_ends - g[0] * transients, spectra[3 : 3 + d] - base - g[0] * base,
+            spectra[3 + d] - by_omega * load, spectra[4 + d] - by_ratio * load, spectra[5 + d], spectra[6 + d :],
+        )  # fmt: skip
+
+
+def _clock_of(test: Measurement) -> tuple[float, tuple[int, ...], tuple[bool, ...]]:
+    """Sample rate, Hz, number of samples of each run, and whether it is at rest at both ends."""
+    if test.whole is not None:
+        return test.whole.sample_rate, test.whole.samples, test.whole.at_rest
+    if test.sample_rate is None:
+        raise InputError(
+            "modes that follow their amplitude move as the records in time say, and of these lines the sample rate is "
+            "not known: make the test of records (Measurement.from_time)"
+        )
+    samples = round(test.sample_rate / np.diff(test.freq).min())
+    return test.sample_rate, (samples,) * test.n_runs, (True,) * test.n_runs
+
+
+def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray, ComplexArray]:
+    """What the laws of a structure add under a test's base motion, from rest.
+
+    To accelerations of the sensors, (runs, n_sensors, n_freq), and to the base force, (runs, d, n_freq).
+    """
+    response, force = np.zeros_like(test.response), np.zeros_like(test.base)
+    if not structure.laws:
+        return response, force
+    modes = Modes(
+        structure.mode_shapes, structure.participation, 2 * np.pi * structure.natural_frequencies,
+        structure.damping_ratios,
+    )  # fmt: skip
+    laws = tuple(ModeLaw(structure.mode_of(law), law.sensor, law.form, law.values) for law in structure.laws)
+    motions = LawMotions(test)
+    ends = np.zeros((structure.n, 2 * sum(not rest for rest in motions.at_rest)))
+    p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)
+    for run, own in enumerate(test.own_lines):
+        for number, law in enumerate(laws):
+            added = motions.of_run(p, run, number).motion
+            response[run][:, own] += modes.phi[:, [law.mode]] * added
+            force[run][:, own] += modes.gamma[law.mode][:, None] * added
+    return response, force
+
+
+def without_laws(test: Measurement, structure: Structure) -> Measurement:
+    """The records as they would be if no mode followed its amplitude."""
+    if not structure.laws:
+        return test
+    response, force = added_by_laws(test, structure)
+    of_force = None if test.force is None else test.force - force
+    return replace(test, response=test.response - response, force=of_force)

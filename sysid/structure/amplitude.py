@@ -1,0 +1,301 @@
+"""Modes whose frequency and damping follow their own amplitude: the law, and its motion in time with sensitivities.
+
+A mode of frequency w and damping ratio zeta moves by ``q'' + 2 zeta(A) w(A) q' + w(A)² q = -load``, with
+``w(A) = w0 (1 - a (A/A0)^p)`` and ``zeta(A) = zeta0 + b (A/A0)^q``, A the envelope of its own acceleration,
+``w(A)² sqrt(q² + (q'/w(A))²)``, times the size of its shape at a sensor; A0 is a level at which a and b are read.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.errors import InputError, refuse, whole_number
+from sysid.structure.thresholds import beyond_chance
+
+Array = NDArray[np.floating[Any]]
+
+SLOWEST, MOST_DAMPED = 0.2, 0.9  # of w0; a damping ratio: no law leads beyond, so that any step of a fit can be tried
+
+
+OF_FREQUENCY, OF_DAMPING = (0.5, 1.0, 2.0), (0.5, 1.0, 2.0, -1.0)
+
+
+@dataclass(frozen=True)
+class AmplitudeLaw:
+    """Modes whose frequency and damping follow their own amplitude: what is stated of it.
+
+    Parameters
+    ----------
+    modes : sequence of int
+        Numbers of these modes, from 1, by frequency within the lines.
+    exponents : (float, float) or "auto"
+        Of the fall of the frequency (1/2, 1 or 2) and of the rise of the damping ratio (-1, as of friction, 1/2, 1 or
+        2) with the level; "auto" takes the likeliest.
+
+    Examples
+    --------
+    >>> AmplitudeLaw(modes=[1])
+    AmplitudeLaw(modes=(1,), exponents='auto')
+    """
+
+    modes: Sequence[int] = (1,)
+    exponents: tuple[float, float] | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.modes, list | tuple) or not self.modes:
+            raise InputError(f"AmplitudeLaw: modes = {self.modes!r}; give numbers of modes, from 1: modes=[1]")
+        modes = tuple(whole_number("AmplitudeLaw: a mode", mode, at_least=1) for mode in self.modes)
+        refuse((len(set(modes)) < len(modes), f"AmplitudeLaw: modes = {list(modes)} names a mode twice"))
+        object.__setattr__(self, "modes", modes)
+        if self.exponents == "auto":
+            return
+        sound = isinstance(self.exponents, list | tuple) and len(self.exponents) == 2
+        sound = sound and self.exponents[0] in OF_FREQUENCY and self.exponents[1] in OF_DAMPING
+        if not sound:
+            raise InputError(
+                f"AmplitudeLaw: exponents = {self.exponents!r}; give 'auto', or one of {OF_FREQUENCY} for the frequency "
+                f"and one of {OF_DAMPING} for the damping"
+            )
+        object.__setattr__(self, "exponents", (float(self.exponents[0]), float(self.exponents[1])))
+
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the fields; `from_tree` takes them back."""
+        return {"modes": np.array(self.modes), "exponents": None if self.exponents == "auto" else np.array(self.exponents)}
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> AmplitudeLaw:
+        """What a tree of `to_tree` stands for."""
+        exponents = tree["exponents"]
+        return cls(tree["modes"].tolist(), "auto" if exponents is None else tuple(exponents.tolist()))
+
+
+class LawForm(NamedTuple):
+    """Form of a law: exponents of the frequency's fall and of the damping's rise, and the level A0, m/s²."""
+
+    of_frequency: float
+    of_damping: float
+    level: float
+
+    @property
+    def size(self) -> int:
+        """Numbers of such a law: a and b."""
+        return 2
+
+    def at(self, A: ca.SX, omega: ca.SX, ratio: ca.SX, values: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Frequency and damping ratio at level A."""
+        unit = A / self.level
+        w = omega * (1 - values[0] * _power(unit, self.of_frequency))
+        zeta = ratio + values[1] * _power(unit, self.of_damping)
+        return ca.fmax(w, SLOWEST * omega), ca.fmin(ca.fmax(zeta, 0.0), MOST_DAMPED)
+
+
+def _power(unit: ca.SX, exponent: float, least: float = 0.01) -> ca.SX:
+    """A power of a level, finite and smooth at rest."""
+    if exponent == 2:
+        return unit**2
+    return (unit**2 + least**2) ** (exponent / 2) - (least**exponent if exponent > 0 else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedLaw:
+    """Law of one mode, as fitted.
+
+    Attributes
+    ----------
+    frequency, ratio : float
+        Hz; damping ratio: both at rest.
+    sensor : int
+        Index of the sensor at which the level counts.
+    form : LawForm
+    values : (k,)
+        a, b of the form.
+    levels : (float, float)
+        m/s², that the mode moved at: all but a twentieth of the time above the first, never above the second.
+    covariance : (2 + k, 2 + k)
+        Of the logarithms of frequency and ratio, and of the values.
+    """
+
+    frequency: float
+    ratio: float
+    sensor: int
+    form: LawForm
+    values: Array
+    levels: tuple[float, float]
+    covariance: Array
+
+    @property
+    def is_certain(self) -> bool:
+        """True where chance does not make such a law."""
+        own = self.covariance[2:, 2:]
+        size = np.sqrt(np.maximum(np.diag(own), np.finfo(float).tiny))
+        unit = self.values / size
+        away = float(unit @ np.linalg.pinv(own / np.outer(size, size), hermitian=True) @ unit)
+        return away > beyond_chance(self.values.size)
+
+    def at(self, level: float) -> tuple[float, float]:
+        """Frequency, Hz, and damping ratio at a level, m/s²."""
+        w, zeta = self.form.at(ca.SX(level), ca.SX(self.frequency), ca.SX(self.ratio), ca.SX(ca.DM(self.values)))
+        return float(w), float(zeta)
+
+    def change(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Relative change of the frequency, and change of the damping ratio, over the levels, with their deviations."""
+        x = ca.SX.sym("x", 2 + self.values.size)
+        low, high = (self.form.at(ca.SX(level), ca.exp(x[0]), ca.exp(x[1]), x[2:]) for level in self.levels)
+        both = ca.vertcat(high[0] / low[0] - 1, high[1] - low[1])
+        function = ca.Function("change", [x], [both, ca.jacobian(both, x)])
+        change, J = function(np.concatenate([np.log([self.frequency, self.ratio]), self.values]))
+        J = np.asarray(J.full())
+        std = np.sqrt(np.maximum(np.diag(J @ self.covariance @ J.T), 0.0))
+        f, zeta = np.asarray(change).ravel()
+        return (float(f), float(zeta)), (float(std[0]), float(std[1]))
+
+    def deviations_at(self, level: float) -> tuple[float, float]:
+        """Standard deviations of both, to first order."""
+        x = ca.SX.sym("x", 2 + self.values.size)
+        both = ca.vertcat(*self.form.at(ca.SX(level), ca.exp(x[0]), ca.exp(x[1]), x[2:]))
+        slope = ca.Function("slope", [x], [ca.jacobian(both, x)])
+        J = np.asarray(slope(np.concatenate([np.log([self.frequency, self.ratio]), self.values])).full())
+        w, zeta = np.sqrt(np.maximum(np.diag(J @ self.covariance @ J.T), 0.0))
+        return float(w), float(zeta)
+
+
+@functools.cache
+def step_of(form: LawForm) -> tuple[ca.Function, ca.Function]:
+    """One step of the motion under a load that is linear between samples, and the restoring acceleration.
+
+    The first takes the state ``(q, q')``, the load at both ends of the step, its length, and the numbers of the mode,
+    ``(log w0, log zeta0, log size, law)``; it gives the next state. The second takes a state and these numbers, and
+    gives ``-2 zeta w q' - w² q``.
+    """
+    state, load, h, p = (ca.SX.sym(name, size) for name, size in zip("zuhp", (2, 2, 1, 3 + form.size), strict=True))
+    w, zeta = _at_state(form, state, p)
+    middle = _step(state, load[0], (load[0] + load[1]) / 2, h / 2, w, zeta)
+    after = _step(state, load[0], load[1], h, *_at_state(form, middle, p))
+    restoring = -2 * zeta * w * state[1] - w**2 * state[0]
+    return ca.Function("step", [state, load, h, p], [after]), ca.Function("restoring", [state, p], [restoring])
+
+
+def _step(z: ca.SX, first: ca.SX, last: ca.SX, h: ca.SX, w: ca.SX, zeta: ca.SX) -> ca.SX:
+    """State after a step of constant frequency and damping, under a load that is linear in it."""
+    damped, slope = w * ca.sqrt(1 - zeta**2), (last - first) / h
+    fall, turn, lift = ca.exp(-zeta * w * h), ca.cos(damped * h), ca.sin(damped * h)
+    forced, then = (-load / w**2 + 2 * zeta * slope / w**3 for load in (first, last))
+    away, speed = z[0] - forced, z[1] + slope / w**2
+    return ca.vertcat(
+        fall * (turn * away + lift / damped * (speed + zeta * w * away)) + then,
+        fall * (turn * speed - lift / damped * (w**2 * away + zeta * w * speed)) - slope / w**2,
+    )
+
+
+def _at_state(form: LawForm, state: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Frequency and damping ratio at a state."""
+    omega, ratio, size = ca.exp(p[0]), ca.exp(p[1]), ca.exp(p[2])
+    still, w, zeta = 1e-12 * form.level / size / omega, omega, ratio
+    for _ in range(4):  # the level is that of the acceleration, which the law itself lowers
+        A = size * w * ca.sqrt((w * state[0]) ** 2 + state[1] ** 2 + still**2)
+        w, zeta = form.at(A, omega, ratio, p[3:])
+    return w, zeta
+
+
+@functools.cache
+def _recursion(form: LawForm, steps: int, directions: int) -> ca.Function:
+    """The motion over all steps; with `directions` of the base, its derivatives too.
+
+    These are by the first state, by the participation in each direction, and by the numbers of the mode.
+    """
+    step, restoring = step_of(form)
+    state, load, h, p = (ca.SX.sym(*one) for one in (("z", 2), ("u", 2), ("h", 1), ("p", 3 + form.size)))
+    after = step(state, load, h, p)
+    if not directions:
+        once = ca.Function("once", [state, load, h, p], [after, restoring(after, p)])
+        return once.mapaccum("motion", steps)
+    count = 2 + directions + p.numel()
+    moves, motions, end = ca.SX.sym("S", 2, count), ca.SX.sym("U", 2, directions), ca.SX.sym("end", 2)
+    own = ca.horzcat(ca.SX.zeros(2, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
+    moved = ca.jacobian(after, state) @ moves + own
+    value = restoring(end, p)
+    slopes = ca.Function("slopes", [end, p], [value, ca.jacobian(value, end), ca.jacobian(value, p)])
+    r, by_end, by_p = slopes(after, p)
+    by = by_end @ moved + ca.horzcat(ca.SX.zeros(1, 2 + directions), by_p)
+    both, all_moves = ca.horzcat(state, moves), ca.horzcat(after, moved)
+    once = ca.Function("once", [both, load, motions, h, p], [all_moves, ca.horzcat(r, by)])
+    return once.mapaccum("motion", steps)
+
+
+def motion(
+    form: LawForm, load: Array, step: float, numbers: Array, initial: Array, motions: Array | None = None
+) -> Array:
+    """Restoring acceleration of a mode at all samples of its load, and its derivatives.
+
+    Parameters
+    ----------
+    load : (n,)
+        Participations times the motion of the base, m/s²; linear from sample to sample.
+    step : float
+        s.
+    numbers : (3 + form.size,)
+        Logarithms of frequency, rad/s, damping ratio and size of the shape, and the law's.
+    initial : (2,)
+        Displacement and velocity at the first sample.
+    motions : (d, n), optional
+        Of the base, for derivatives by participations.
+
+    Returns
+    -------
+    (n,) or, with `motions`, (3 + d + numbers.size, n)
+        ``-2 zeta w q' - w² q``; then its derivatives by the initial state, by participations, by the numbers.
+    """
+    pairs = np.stack([load[:-1], load[1:]])
+    p = ca.DM(numbers)
+    if motions is None:
+        recursion = _recursion(form, load.size - 1, 0)
+        _, rest = recursion(ca.DM(initial), pairs, step, p)
+        first = step_of(form)[1](initial, p)
+        return np.append(np.asarray(first).ravel(), np.asarray(rest).ravel())
+    d, count = len(motions), 2 + len(motions) + numbers.size
+    state = np.zeros((2, 1 + count))
+    state[:, 0], state[:, 1:3] = initial, np.eye(2)
+    both = np.stack([motions[:, :-1].T, motions[:, 1:].T])  # (2, n - 1, d): a pair of columns a step
+    recursion = _recursion(form, load.size - 1, d)
+    _, rows = recursion(ca.DM(state), pairs, both.reshape(2, -1), step, p)
+    z = ca.SX.sym("z", 2)
+    n = ca.SX.sym("p", numbers.size)
+    value = step_of(form)[1](z, n)
+    first = ca.Function("first", [z, n], [ca.horzcat(value, ca.jacobian(value, z), ca.SX(1, d), ca.jacobian(value, n))])
+    rows = np.asarray(rows).reshape(-1, 1 + count)
+    return np.vstack([np.asarray(first(initial, p).full()), rows]).T
+
+
+def in_time(law: FittedLaw, numbers: Array, load: Array, rate: float, initial: Array, per_period: float = 96.0) -> Array:
+    """Acceleration of a mode that follows a law, at the samples of its load, (n,).
+
+    The load, m/s², is the natural spline through its samples, straight over steps of `per_period` in a period.
+    `numbers` and `initial` are those of `motion`.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    times = max(int(np.ceil(per_period * np.exp(numbers[0]) / (2 * np.pi) / rate)), 1)
+    samples = np.arange(load.size)
+    fine = make_interp_spline(samples, load, k=3, bc_type="natural")(np.arange((load.size - 1) * times + 1) / times)
+    return motion(law.form, fine, 1 / (rate * times), numbers, initial)[::times] - load
+
+
+def laws_to_tree(laws: Sequence[FittedLaw]) -> list[dict[str, Any]] | None:
+    """Laws as dictionaries, for `laws_from_tree`; None without any."""
+    return [{**vars(law), "form": np.array(law.form), "levels": np.array(law.levels)} for law in laws] or None
+
+
+def laws_from_tree(tree: list[dict[str, Any]] | None) -> tuple[FittedLaw, ...]:
+    """Laws that `laws_to_tree` made a tree of."""
+    return tuple(
+        FittedLaw(**{**law, "form": LawForm(*law["form"].tolist()), "levels": tuple(law["levels"].tolist())})
+        for law in tree or ()
+    )
