@@ -32,9 +32,9 @@ from sysid.search.modal import Modal
 from sysid.search.session import Progress
 from sysid.search.strategy import History
 from sysid.search.swarm import Swarm
+from sysid.structure.amplitude import AmplitudeLaw, FittedLaw
 from sysid.structure.sensor import rigid_body
 from sysid.structure.structure import Structure
-from sysid.structure.amplitude import AmplitudeLaw, FittedLaw
 from sysid.structure.superelement import ResidualModes
 from sysid.swarm import SwarmSettings, minimize_swarm
 
@@ -67,12 +67,56 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
-    "AmplitudeLaw", "FittedLaw",
-    "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
-    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
-    "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "ResidualModes", "Sensor", "SolverError",
-    "SpectralStiffness", "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores",
-    "Totals", "Unknown", "Variable", "__version__", "catalogue", "excited_band", "export", "identify", "jobs", "load",
-    "minimize_swarm", "plot", "read", "real_and_imaginary", "resample", "rigid_body", "simulate", "time_scores",
+    "AmplitudeLaw",
+    "ChainStiffness",
+    "Continuation",
+    "FittedLaw",
+    "FullMass",
+    "FurtherTest",
+    "History",
+    "Identification",
+    "InputError",
+    "KnownMass",
+    "LumpedMass",
+    "MassBlocks",
+    "MatrixModel",
+    "Measurement",
+    "Modal",
+    "ModalDamping",
+    "NoiseLevels",
+    "Prior",
+    "Problem",
+    "Progress",
+    "ProportionalDamping",
+    "Recipe",
+    "ResidualModes",
+    "Sensor",
+    "SolverError",
+    "SpectralStiffness",
+    "Stated",
+    "StiffnessBlocks",
+    "Structure",
+    "Swarm",
+    "SwarmSettings",
+    "SysidError",
+    "TimeScores",
+    "Totals",
+    "Unknown",
+    "Variable",
+    "__version__",
+    "catalogue",
+    "excited_band",
+    "export",
+    "identify",
+    "jobs",
+    "load",
+    "minimize_swarm",
+    "plot",
+    "read",
+    "real_and_imaginary",
+    "resample",
+    "rigid_body",
+    "simulate",
+    "time_scores",
     "write_report",
 ]  # fmt: skip

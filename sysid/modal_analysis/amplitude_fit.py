@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, unit_diagonal
 from sysid.modal_analysis.residues import line_correlation
-from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm, motion
+from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import ComplexArray
 from sysid.structure.thresholds import EPSILON, ROUND_OFF
 
@@ -54,14 +55,13 @@ def _with_laws(
         linear = refitted(linear, linear.parameters, monitor=monitor)
     monitor.keep_instead(linear)
     own = _modes_of(linear, stated)
-    best = None
-    for exponents in _exponents(stated):
-        monitor.doing = f"a law of amplitude, exponents {exponents[0]:g} and {exponents[1]:g}"
-        found = _begun(linear, own, exponents, tries, monitor) if best is None else _other(best, exponents, monitor)
-        if best is None or found.likelihood > best.likelihood:
-            best = found
-            monitor.keep_instead(best)
-    assert best is not None
+    first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
+    monitor.doing = "a law of amplitude"
+    best = _begun(linear, own, first, tries, monitor)
+    monitor.keep_instead(best)
+    if stated.exponents == "auto":
+        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
+        best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
     if plain and not fit.model.whole.plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
         best = refitted(replace(best, test=fit.test, levels=fit.levels), best.parameters, monitor=monitor)
@@ -82,15 +82,6 @@ def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
     return [int(order[mode - 1]) for mode in stated.modes]
 
 
-def _exponents(stated: AmplitudeLaw) -> Iterator[tuple[float, float]]:
-    if stated.exponents != "auto":
-        yield stated.exponents
-        return
-    for of_frequency in OF_FREQUENCY:
-        for of_damping in OF_DAMPING:
-            yield of_frequency, of_damping
-
-
 def _begun(
     linear: RecordFit, own: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
 ) -> RecordFit:
@@ -103,16 +94,27 @@ def _begun(
             sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
             form = LawForm(*exponents, _levels(linear, k, sensor)[1])
             laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0])))
-        modes = p.modes._replace(omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), own), 1 + fall / 2, 1))
+        modes = p.modes._replace(
+            omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), own), 1 + fall / 2, 1)
+        )
         found.append(refitted(linear, replace(p, modes=modes, laws=tuple(laws)), limits=ROUGH, monitor=monitor))
     best = max(found, key=lambda one: one.likelihood)
     return refitted(best, best.parameters, monitor=monitor)
 
 
-def _other(fit: RecordFit, exponents: tuple[float, float], monitor: FitMonitor) -> RecordFit:
-    """Laws of other exponents, from what these say at the highest level and half of it."""
-    laws = tuple(law._replace(form=law.form._replace(of_frequency=exponents[0], of_damping=exponents[1])) for law in fit.parameters.laws)
-    return refitted(fit, replace(fit.parameters, laws=laws), monitor=monitor)
+def _likeliest(
+    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], monitor: FitMonitor
+) -> RecordFit:
+    """The likeliest of a fit and of those with other exponents, from what its laws say at the highest level."""
+    for exponent in exponents:
+        monitor.doing = f"a law of amplitude, exponent {exponent:g} {which.replace('_', ' ')}"
+        p = best.parameters
+        laws = tuple(law._replace(form=law.form._replace(**{which: exponent})) for law in p.laws)
+        found = refitted(best, replace(p, laws=laws), monitor=monitor)
+        if found.likelihood > best.likelihood:
+            best = found
+            monitor.keep_instead(best)
+    return best
 
 
 def _white_errors(fit: RecordFit) -> ComplexArray:
@@ -128,9 +130,8 @@ def _white_errors(fit: RecordFit) -> ComplexArray:
 def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tuple[float, float]:
     """Level that a mode exceeds but for a `share` of the time, and its highest, m/s²: of the linear mode."""
     whole, parts = fit.model.whole, []
-    for number, (samples, own) in enumerate(zip(whole.samples, fit.test.own_lines, strict=True)):
+    for number, samples in enumerate(whole.samples):
         spectrum = np.zeros(samples, complex)
-        freq = fit.test.freq[own]
         for chunk in fit.model.chunks(fit.parameters):
             if chunk.run.number == number:
                 at = np.round(chunk.run.w / (2 * np.pi) * samples / whole.sample_rate).astype(int)
@@ -151,7 +152,11 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
     covariance = half @ half.T / np.outer(size, size) / 2 * widened
     first = model.of_laws.start
     for law in p.laws:
-        at = [model.index.log_omega.start + law.mode, model.index.log_ratios.start + law.mode, *range(first, first + law.form.size)]
+        at = [
+            model.index.log_omega.start + law.mode,
+            model.index.log_ratios.start + law.mode,
+            *range(first, first + law.form.size),
+        ]
         first += law.form.size
         omega, ratio = float(p.modes.omega[law.mode]), float(p.modes.ratios[law.mode])
         found.append(

@@ -97,24 +97,20 @@ class LawMotions:
     def _added(self, p: Parameters, run: int, law: ModeLaw) -> Addition:
         modes, k = p.modes, law.mode
         times, series = self.in_time(run, k, float(modes.omega[k]))
-        d, moving = len(series), [at for at, rest in enumerate(self.at_rest) if not rest]
-        ends = np.zeros(2)
-        if run in moving:
-            ends = p.ends[k, 2 * moving.index(run) : 2 * moving.index(run) + 2]
+        d, rest = len(series), self.at_rest[run]
+        first = 2 * sum(not one for one in self.at_rest[:run])
+        ends = np.zeros(2) if rest else p.ends[k, first : first + 2]
         gamma, omega, ratio = modes.gamma[k], modes.omega[k], modes.ratios[k]
         numbers = np.concatenate([np.log([omega, ratio, abs(modes.phi[law.sensor, k])]), law.values])
         step = 1 / (self.rate * times)
         rows = motion(law.form, gamma @ series, step, numbers, ends[::-1], series)
         spectra = np.fft.rfft(rows[:, ::times])[:, self.places(run)] / self.rate
         w, base = 2 * np.pi * self.lines[run], self.base[run]
-        g, slopes = gains_and_slopes(self.lines[run], modes.omega[[k]], modes.ratios[[k]])
-        by_omega, by_ratio = slopes.reshape(2, -1)
-        transients = np.stack([1 / w**2, 1j / w])
-        if run not in moving:
-            transients = transients * 0
+        g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], modes.omega[[k]], modes.ratios[[k]])
+        transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
         load = gamma @ base + ends @ transients
         here = spectra[0] - gamma @ base
-        by_ends = np.stack([spectra[2], spectra[1]]) * (run in moving)
+        by_ends = np.zeros((2, w.size)) if rest else spectra[[2, 1]]
         return Addition(
             here - g[0] * load, by_ends - g[0] * transients, spectra[3 : 3 + d] - base - g[0] * base,
             spectra[3 + d] - by_omega * load, spectra[4 + d] - by_ratio * load, spectra[5 + d], spectra[6 + d :],

@@ -177,7 +177,7 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": self.model.whole.plain, 
+            "gains": p.gains, "plain": self.model.whole.plain,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
 

@@ -60,15 +60,17 @@ class AmplitudeLaw:
         sound = sound and self.exponents[0] in OF_FREQUENCY and self.exponents[1] in OF_DAMPING
         if not sound:
             raise InputError(
-                f"AmplitudeLaw: exponents = {self.exponents!r}; give 'auto', or one of {OF_FREQUENCY} for the frequency "
-                f"and one of {OF_DAMPING} for the damping"
+                f"AmplitudeLaw: exponents = {self.exponents!r}; give 'auto', or one of {OF_FREQUENCY} for the "
+                f"frequency and one of {OF_DAMPING} for the damping"
             )
         object.__setattr__(self, "exponents", (float(self.exponents[0]), float(self.exponents[1])))
 
-
     def to_tree(self) -> dict[str, Any]:
         """Give the fields; `from_tree` takes them back."""
-        return {"modes": np.array(self.modes), "exponents": None if self.exponents == "auto" else np.array(self.exponents)}
+        return {
+            "modes": np.array(self.modes),
+            "exponents": None if self.exponents == "auto" else np.array(self.exponents),
+        }
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> AmplitudeLaw:
@@ -97,11 +99,11 @@ class LawForm(NamedTuple):
         return ca.fmax(w, SLOWEST * omega), ca.fmin(ca.fmax(zeta, 0.0), MOST_DAMPED)
 
 
-def _power(unit: ca.SX, exponent: float, least: float = 0.01) -> ca.SX:
-    """A power of a level, finite and smooth at rest."""
+def _power(unit: ca.SX, exponent: float) -> ca.SX:
+    """A power of a level that is finite, and smooth, at rest."""
     if exponent == 2:
         return unit**2
-    return (unit**2 + least**2) ** (exponent / 2) - (least**exponent if exponent > 0 else 0.0)
+    return (unit**2 + (1e-12 if exponent > 0 else 1e-6)) ** (exponent / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,41 +170,43 @@ class FittedLaw:
 
 
 @functools.cache
-def step_of(form: LawForm) -> tuple[ca.Function, ca.Function]:
-    """One step of the motion under a load that is linear between samples, and the restoring acceleration.
+def _functions(form: LawForm) -> tuple[ca.Function, ca.Function]:
+    """First state and one step of the motion of a mode, under a load that is linear between samples.
 
-    The first takes the state ``(q, q')``, the load at both ends of the step, its length, and the numbers of the mode,
-    ``(log w0, log zeta0, log size, law)``; it gives the next state. The second takes a state and these numbers, and
-    gives ``-2 zeta w q' - w² q``.
+    The numbers of the mode are ``(log w0, log zeta0, log size, law)``; a state is ``(q, q', A)``. A step has the
+    frequency and damping of the level at its beginning, which is that of the acceleration by the frequency of the step
+    before: the law itself lowers the level that it is of. The first function takes ``(q, q')`` and these numbers. The
+    second takes a state, the load at both ends of the step, its length and these numbers, and gives the next state and
+    ``-2 zeta w q' - w² q`` at its beginning.
     """
-    state, load, h, p = (ca.SX.sym(name, size) for name, size in zip("zuhp", (2, 2, 1, 3 + form.size), strict=True))
-    w, zeta = _at_state(form, state, p)
-    middle = _step(state, load[0], (load[0] + load[1]) / 2, h / 2, w, zeta)
-    after = _step(state, load[0], load[1], h, *_at_state(form, middle, p))
+    p, h = ca.SX.sym("p", 3 + form.size), ca.SX.sym("h")
+    omega, ratio, size = ca.exp(p[0]), ca.exp(p[1]), ca.exp(p[2])
+
+    def level(q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
+        return size * w * ca.sqrt((w * q) ** 2 + v**2 + (1e-12 * form.level / (size * omega)) ** 2)
+
+    begin = ca.SX.sym("begin", 2)
+    w = omega
+    for _ in range(4):
+        w, _ = form.at(level(begin[0], begin[1], w), omega, ratio, p[3:])
+    first = ca.Function("first", [begin, p], [ca.vertcat(begin, level(begin[0], begin[1], w))])
+    state, load = ca.SX.sym("z", 3), ca.SX.sym("u", 2)
+    w, zeta = form.at(state[2], omega, ratio, p[3:])
+    q, v = _step(state, load[0], load[1], h, w, zeta)
     restoring = -2 * zeta * w * state[1] - w**2 * state[0]
-    return ca.Function("step", [state, load, h, p], [after]), ca.Function("restoring", [state, p], [restoring])
+    step = ca.Function("step", [state, load, h, p], [ca.vertcat(q, v, level(q, v, w)), restoring])
+    return first, step
 
 
-def _step(z: ca.SX, first: ca.SX, last: ca.SX, h: ca.SX, w: ca.SX, zeta: ca.SX) -> ca.SX:
-    """State after a step of constant frequency and damping, under a load that is linear in it."""
+def _step(z: ca.SX, first: ca.SX, last: ca.SX, h: ca.SX, w: ca.SX, zeta: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Motion after a step of constant frequency and damping, under a load that is linear in it."""
     damped, slope = w * ca.sqrt(1 - zeta**2), (last - first) / h
     fall, turn, lift = ca.exp(-zeta * w * h), ca.cos(damped * h), ca.sin(damped * h)
     forced, then = (-load / w**2 + 2 * zeta * slope / w**3 for load in (first, last))
     away, speed = z[0] - forced, z[1] + slope / w**2
-    return ca.vertcat(
-        fall * (turn * away + lift / damped * (speed + zeta * w * away)) + then,
-        fall * (turn * speed - lift / damped * (w**2 * away + zeta * w * speed)) - slope / w**2,
-    )
-
-
-def _at_state(form: LawForm, state: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Frequency and damping ratio at a state."""
-    omega, ratio, size = ca.exp(p[0]), ca.exp(p[1]), ca.exp(p[2])
-    still, w, zeta = 1e-12 * form.level / size / omega, omega, ratio
-    for _ in range(4):  # the level is that of the acceleration, which the law itself lowers
-        A = size * w * ca.sqrt((w * state[0]) ** 2 + state[1] ** 2 + still**2)
-        w, zeta = form.at(A, omega, ratio, p[3:])
-    return w, zeta
+    q = fall * (turn * away + lift / damped * (speed + zeta * w * away)) + then
+    v = fall * (turn * speed - lift / damped * (w**2 * away + zeta * w * speed)) - slope / w**2
+    return q, v
 
 
 @functools.cache
@@ -211,22 +215,19 @@ def _recursion(form: LawForm, steps: int, directions: int) -> ca.Function:
 
     These are by the first state, by the participation in each direction, and by the numbers of the mode.
     """
-    step, restoring = step_of(form)
-    state, load, h, p = (ca.SX.sym(*one) for one in (("z", 2), ("u", 2), ("h", 1), ("p", 3 + form.size)))
-    after = step(state, load, h, p)
+    step = _functions(form)[1]
+    state, load, h, p = (ca.SX.sym(*one) for one in (("z", 3), ("u", 2), ("h", 1), ("p", 3 + form.size)))
+    after, restoring = step(state, load, h, p)
     if not directions:
-        once = ca.Function("once", [state, load, h, p], [after, restoring(after, p)])
-        return once.mapaccum("motion", steps)
+        return step.mapaccum("motion", steps)
     count = 2 + directions + p.numel()
-    moves, motions, end = ca.SX.sym("S", 2, count), ca.SX.sym("U", 2, directions), ca.SX.sym("end", 2)
-    own = ca.horzcat(ca.SX.zeros(2, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
+    moves, motions = ca.SX.sym("S", 3, count), ca.SX.sym("U", 2, directions)
+    own = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
     moved = ca.jacobian(after, state) @ moves + own
-    value = restoring(end, p)
-    slopes = ca.Function("slopes", [end, p], [value, ca.jacobian(value, end), ca.jacobian(value, p)])
-    r, by_end, by_p = slopes(after, p)
-    by = by_end @ moved + ca.horzcat(ca.SX.zeros(1, 2 + directions), by_p)
-    both, all_moves = ca.horzcat(state, moves), ca.horzcat(after, moved)
-    once = ca.Function("once", [both, load, motions, h, p], [all_moves, ca.horzcat(r, by)])
+    by = ca.jacobian(restoring, state) @ moves
+    by += ca.horzcat(ca.SX.zeros(1, 2 + directions), ca.jacobian(restoring, p))
+    outputs = [ca.horzcat(after, moved), ca.horzcat(restoring, by)]
+    once = ca.Function("once", [ca.horzcat(state, moves), load, motions, h, p], outputs)
     return once.mapaccum("motion", steps)
 
 
@@ -253,28 +254,24 @@ def motion(
     (n,) or, with `motions`, (3 + d + numbers.size, n)
         ``-2 zeta w q' - w² q``; then its derivatives by the initial state, by participations, by the numbers.
     """
-    pairs = np.stack([load[:-1], load[1:]])
-    p = ca.DM(numbers)
+    first = _functions(form)[0]
+    pairs = np.stack([load, np.append(load[1:], load[-1])])
     if motions is None:
-        recursion = _recursion(form, load.size - 1, 0)
-        _, rest = recursion(ca.DM(initial), pairs, step, p)
-        first = step_of(form)[1](initial, p)
-        return np.append(np.asarray(first).ravel(), np.asarray(rest).ravel())
-    d, count = len(motions), 2 + len(motions) + numbers.size
-    state = np.zeros((2, 1 + count))
-    state[:, 0], state[:, 1:3] = initial, np.eye(2)
-    both = np.stack([motions[:, :-1].T, motions[:, 1:].T])  # (2, n - 1, d): a pair of columns a step
-    recursion = _recursion(form, load.size - 1, d)
-    _, rows = recursion(ca.DM(state), pairs, both.reshape(2, -1), step, p)
-    z = ca.SX.sym("z", 2)
-    n = ca.SX.sym("p", numbers.size)
-    value = step_of(form)[1](z, n)
-    first = ca.Function("first", [z, n], [ca.horzcat(value, ca.jacobian(value, z), ca.SX(1, d), ca.jacobian(value, n))])
-    rows = np.asarray(rows).reshape(-1, 1 + count)
-    return np.vstack([np.asarray(first(initial, p).full()), rows]).T
+        _, rows = _recursion(form, load.size, 0)(first(initial, numbers), pairs, step, numbers)
+        return np.asarray(rows).ravel()
+    d = len(motions)
+    state = np.zeros((3, 3 + d + numbers.size))
+    state[:, :1] = first(initial, numbers)
+    by_initial, by_numbers = first.jacobian()(initial, numbers, state[:, :1])
+    state[:, 1:3], state[:, 3 + d :] = by_initial.full(), by_numbers.full()
+    both = np.stack([motions, np.hstack([motions[:, 1:], motions[:, -1:]])]).transpose(0, 2, 1)  # a pair of rows a step
+    _, rows = _recursion(form, load.size, d)(state, pairs, both.reshape(2, -1), step, numbers)
+    return np.asarray(rows.full()).reshape(load.size, -1).T
 
 
-def in_time(law: FittedLaw, numbers: Array, load: Array, rate: float, initial: Array, per_period: float = 96.0) -> Array:
+def in_time(
+    law: FittedLaw, numbers: Array, load: Array, rate: float, initial: Array, per_period: float = 96.0
+) -> Array:
     """Acceleration of a mode that follows a law, at the samples of its load, (n,).
 
     The load, m/s², is the natural spline through its samples, straight over steps of `per_period` in a period.

@@ -190,10 +190,9 @@ class Structure:
         rigid = np.hstack([np.eye(n), -self.rigid_body_dofs])  # of relative motion
         for law in self.laws:
             k = self.mode_of(law)
-            # What the law says at rest is near the mode's own; the change is what counts.
-            rest, there = law.at(0.0), law.at(level)
-            w = self._omega[k] * np.array([1.0, there[0] / rest[0]])
-            zeta = self.damping_ratios[k] + np.array([0.0, there[1] - rest[1]])
+            frequency, ratio = law.at(level)
+            w = self._omega[k] * np.array([1.0, frequency / law.frequency])
+            zeta = self.damping_ratios[k] + np.array([0.0, ratio - law.ratio])
             row = self.normal_modes[:, k] @ self.mass[:n, :n]
             K += (w[1] ** 2 - w[0] ** 2) * np.outer(row @ rigid, row @ rigid)
             C += 2 * (zeta[1] * w[1] - zeta[0] * w[0]) * np.outer(row, row)

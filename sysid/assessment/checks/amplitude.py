@@ -30,7 +30,8 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         elif LIKELY * std < law.ratio:  # less than half the half-power width
             yield Finding(
                 "linear", Severity.NOTE,
-                f"mode {mode} is linear {over}: its frequency changes by less than {100 * (abs(f) + LIKELY * std):.2g} %",
+                f"mode {mode} is linear {over}: its frequency changes by less than "
+                f"{100 * (abs(f) + LIKELY * std):.2g} %",
                 numbers=numbers,
             )  # fmt: skip
         else:
