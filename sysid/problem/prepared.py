@@ -243,7 +243,8 @@ class Prepared(SearchSpace):
         if count is not None:
             more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
-            self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
+            laws, modal = self.modal[0].laws, estimate(more, self.modal[0].calibration)
+            self.modal = (modal if modal.laws else replace(modal, laws=laws), *self.modal[1:])
 
     def follow_amplitude(self, monitor: FitMonitor) -> None:
         """Fit the laws that are asked for to the problem's own whole records."""

@@ -1,0 +1,166 @@
+"""Laws of amplitude as a term of the model of whole records: exact derivatives, and what records tell of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.modal_analysis.modal_model import ModeLaw
+from sysid.modal_analysis.record_fit import record_modes
+from sysid.structure.amplitude import LawForm
+
+RATE, FALL, RISE, LEVEL = 40.0, 0.06, 0.012, 12.0
+OMEGA, RATIOS = 2 * np.pi * np.array([3.0, 8.0]), np.array([0.012, 0.01])
+PHI = np.array([[0.5, 0.85], [0.85, -0.5]])  # two equal masses of 1 kg
+GAMMA = PHI.T @ np.ones(2)
+STEPS = 12  # of a sample
+
+
+def moved(base, *, law=True):
+    """Absolute accelerations by a Runge-Kutta method of fourth order, the base straight from sample to sample."""
+    n = base.size * STEPS
+    fine = np.interp(np.arange(n) / STEPS, np.arange(base.size), base)
+    middle = np.interp((np.arange(n) + 0.5) / STEPS, np.arange(base.size), base)
+    h, size = 1 / (RATE * STEPS), np.abs(PHI[:, 0]).max()
+
+    def slope(y, u):
+        q, v = y
+        w, zeta = OMEGA.copy(), RATIOS.copy()
+        if law:
+            for _ in range(8):
+                level = size * w[0] * np.hypot(w[0] * q[0], v[0]) / LEVEL
+                w[0] = OMEGA[0] * (1 - FALL * np.sqrt(level))
+            zeta[0] = RATIOS[0] + RISE * level
+        return np.array([v, -2 * zeta * w * v - w**2 * q - GAMMA * u])
+
+    y, out = np.zeros((2, 2)), []
+    for k in range(n - 1):
+        if k % STEPS == 0:
+            out.append(PHI @ slope(y, fine[k])[1] + fine[k])
+        a = slope(y, fine[k])
+        b = slope(y + h / 2 * a, middle[k])
+        c = slope(y + h / 2 * b, middle[k])
+        y = y + h / 6 * (a + 2 * b + 2 * c + slope(y + h * c, fine[k + 1]))
+    return np.array(out).T
+
+
+def shaken(level, seed, samples=1200):
+    rng = np.random.default_rng(seed)
+    spectrum = np.fft.rfft(rng.standard_normal(samples))
+    freq = np.fft.rfftfreq(samples, 1 / RATE)
+    spectrum[(freq < 0.8) | (freq > 11.0)] = 0
+    base = np.fft.irfft(spectrum, samples)
+    t = np.arange(samples) / RATE
+    return level * base / base.std() * np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
+
+
+def test_of(levels, *, law=True, noise=0.005, seed=0, samples=1200):
+    rng, runs = np.random.default_rng(seed), []
+    for number, level in enumerate(levels):
+        base = shaken(level, 10 * seed + number, samples)
+        response = moved(base, law=law)
+        noisy = response + noise * response.std(axis=1, keepdims=True) * rng.standard_normal(response.shape)
+        runs.append((base[None] + noise * base.std() * rng.standard_normal(base.size), noisy, None))
+    sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x") for i in (1, 2)]
+    return sysid.Measurement.from_time(runs, RATE, rigid_body=np.ones((2, 1)), band=(0.8, 12.0), sensors=sensors)
+
+
+test_of.__test__ = False
+
+
+@pytest.fixture(scope="module")
+def test():
+    return test_of((0.3, 3.0))
+
+
+@pytest.fixture(scope="module")
+def answer(test):
+    problem = sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 1.0)))
+    return sysid.identify(problem, rng=0)
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+@pytest.mark.parametrize("form", [LawForm(0.5, 0.5, 10.0), LawForm(2.0, -1.0, 10.0)])
+def test_the_gradient_of_the_fit_is_that_of_differences(test, form, at_rest):
+    test = replace(test, whole=replace(test.whole, at_rest=(at_rest, False)))
+    fit = record_modes(test, OMEGA, RATIOS)
+    p, rng = replace(fit.parameters, laws=(ModeLaw(0, 1, form, np.array([0.02, 0.003])),)), np.random.default_rng(1)
+    model = fit.model_of(p)
+    x, exact = model.pack(p), model.normal_equations(p, fit.levels)
+    unit = np.where(model.held, 0.0, 1 / np.sqrt(np.maximum(np.diag(exact.normal), 1e-300)))
+    assert np.array_equal(model.pack(model.unpack(x)), x)
+    for part in (model.index.phi, model.index.gamma, model.index.log_omega, model.of_laws, slice(0, model.size)):
+        step = np.zeros(x.size)
+        step[part] = (rng.standard_normal(x.size) * unit)[part]
+
+        def chi2(times, step=step):
+            return model.chi2(model.unpack(x + times * step), fit.levels)
+
+        difference = (8 * (chi2(0.1) - chi2(-0.1)) - (chi2(0.2) - chi2(-0.2))) / 1.2
+        assert difference == pytest.approx(-2 * exact.gradient @ step, rel=1e-6)
+
+
+def test_the_law_is_found_within_its_deviations(answer):
+    (law,) = answer.structure.laws
+    scale = LEVEL / law.form.level
+    truth = np.concatenate([np.log([3.0, 0.012]), [FALL * scale**-0.5, RISE / scale]])
+    found = np.concatenate([np.log([law.frequency, law.ratio]), law.values])
+    assert np.all(np.abs(found - truth) < 5 * np.sqrt(np.diag(law.covariance)))
+    assert np.sqrt(law.covariance[2, 2]) < 0.02 * law.values[0]  # and they say something
+    assert [one.kind for one in answer.findings].count("amplitude law") == 1
+    assert not any(one.kind == "changing" for one in answer.findings)
+    assert np.allclose(answer.structure.natural_frequencies, [3.0, 8.0], rtol=2e-3)
+
+
+def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(test, answer):
+    base = shaken(1.5, 77)
+    truth = moved(base)
+    unseen = sysid.Measurement.from_time(
+        [(base[None, : truth.shape[1]], truth, None)], RATE, rigid_body=np.ones((2, 1)), band=(0.8, 12.0)
+    )
+    plain = sysid.identify(sysid.Problem(test), rng=0)
+
+    def missed(result):
+        return np.linalg.norm(result.predict(unseen) - unseen.relative) / np.linalg.norm(unseen.relative)
+
+    assert missed(answer) < 0.05
+    assert missed(answer) < 0.25 * missed(plain)
+    in_time = answer.structure.simulate(base[None], RATE)[:, : truth.shape[1]]
+    assert np.linalg.norm(in_time - truth) < 0.05 * np.linalg.norm(truth - base[: truth.shape[1]])
+
+
+def test_a_stored_answer_keeps_its_law(answer, tmp_path):
+    again = sysid.load(answer.save(tmp_path / "result.h5"))
+    assert again.structure.laws[0].at(4.0) == answer.structure.laws[0].at(4.0)
+    assert again.problem.amplitude == answer.problem.amplitude
+    assert again.prepared.modal[0].omega == pytest.approx(answer.prepared.modal[0].omega, rel=1e-12)
+    assert again.residual == pytest.approx(answer.residual, rel=1e-9)
+
+
+def test_a_linear_structure_is_told_to_be_one():
+    test = test_of((0.3, 3.0), law=False)
+    law = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 0.5))), rng=0)
+    plain = sysid.identify(sysid.Problem(test), rng=0)
+    assert law.structure.laws == ()
+    assert [one.kind for one in law.findings if one.kind in ("linear", "amplitude law", "amplitude open")] == ["linear"]
+    assert np.array_equal(law.structure.mass, plain.structure.mass)
+
+
+def test_one_short_run_of_one_level_leaves_the_law_open():
+    test = test_of((0.5,), noise=0.3, samples=400)
+    result = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 0.5))), rng=0)
+    assert result.structure.laws == ()
+    assert any(one.kind == "amplitude open" for one in result.findings)
+
+
+def test_a_mode_that_the_records_do_not_show_is_refused(test):
+    with pytest.raises(sysid.InputError, match="mode 5"):
+        sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(modes=[5])), rng=0)
+
+
+def test_spectra_have_no_amplitude():
+    one = sysid.Structure(np.diag([1.0, 0.0]), 100 * np.array([[1, -1], [-1, 1]]), [0.01], n_base=1)
+    test = sysid.simulate(one, np.linspace(1, 10, 50))
+    with pytest.raises(sysid.InputError, match="whole records"):
+        sysid.Problem(test, amplitude=sysid.AmplitudeLaw())

@@ -1,0 +1,133 @@
+"""A mode whose frequency and damping follow its amplitude, against an independent integrator and differences."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import sysid
+from sysid.structure.amplitude import FittedLaw, LawForm, motion
+
+RATE = 200.0
+OMEGA, RATIO, SIZE = 2 * np.pi * 4.0, 0.012, 1.3
+
+
+def load(n=800):
+    t = np.arange(n) / RATE
+    return 3.0 * np.sin(2 * np.pi * 3.7 * t) + 2.0 * np.sin(2 * np.pi * 1.1 * t + 0.4)
+
+
+def numbers(fall, rise):
+    return np.array([np.log(OMEGA), np.log(RATIO), np.log(SIZE), fall, rise])
+
+
+def of_level(form, fall, rise, q, v):
+    """Frequency and damping where the level is that of the acceleration at the frequency itself."""
+    w = OMEGA
+    for _ in range(60):
+        level = SIZE * w * np.hypot(w * q, v) / form.level
+        w = OMEGA * (1 - fall * level**form.of_frequency)
+    return w, RATIO + rise * level**form.of_damping
+
+
+@pytest.mark.parametrize(
+    ("form", "fall", "rise"),
+    [
+        (LawForm(0.5, 1.0, 20.0), 0.03, 0.01),
+        (LawForm(1.0, 0.5, 20.0), -0.02, 0.004),
+        (LawForm(2.0, 2.0, 80.0), 0.05, 0.002),
+    ],
+)
+def test_the_motion_is_that_of_an_independent_integrator(form, fall, rise):
+    u, initial = load(), np.array([2e-3, 0.03])
+    fine = 8
+    t = np.arange((u.size - 1) * fine + 1) / (RATE * fine)
+    dense = np.interp(t, np.arange(u.size) / RATE, u)
+
+    def slope(at, y):
+        w, zeta = of_level(form, fall, rise, *y)
+        return [y[1], -2 * zeta * w * y[1] - w**2 * y[0] - np.interp(at, t, dense)]
+
+    answer = solve_ivp(slope, (0, t[-1]), initial, t_eval=t[::fine], rtol=1e-9, atol=1e-12, max_step=1 / RATE)
+    expected = []
+    for q, v in answer.y.T:
+        w, zeta = of_level(form, fall, rise, q, v)
+        expected.append(-2 * zeta * w * v - w**2 * q)
+    found = motion(form, dense, 1 / (RATE * fine), numbers(fall, rise), initial)[::fine]
+    assert np.linalg.norm(found - expected) < 3e-4 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("form", [LawForm(0.5, -1.0, 20.0), LawForm(1.0, 2.0, 20.0)])
+def test_derivatives_are_those_of_differences(form):
+    u, values = np.stack([load(300), np.roll(load(300), 7)]), numbers(0.03, 0.002)
+    gamma, initial = np.array([1.1, 0.4]), np.array([2e-3, 0.03])
+    exact = motion(form, gamma @ u, 1 / RATE, values, initial, u)
+    x = np.concatenate([initial, gamma, values])
+
+    def at(x):
+        return motion(form, x[2:4] @ u, 1 / RATE, x[4:], x[:2])
+
+    assert np.allclose(exact[0], at(x), rtol=1e-12)
+    for k in range(x.size):
+        h = 1e-4 * max(abs(x[k]), 1e-3)
+        far, near = (at(x + m * h * np.eye(x.size)[k]) - at(x - m * h * np.eye(x.size)[k]) for m in (2, 1))
+        difference = (8 * near - far) / (12 * h)
+        assert np.abs(exact[1 + k] - difference).max() < 1e-5 * np.abs(difference).max()
+
+
+def law(fall=0.03, rise=0.01):
+    return FittedLaw(4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([fall, rise]), (0.1, 20.0), 1e-8 * np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def linear():
+    k = 900.0
+    K = k * np.array([[2.0, -1, -1], [-1, 1, 0], [-1, 0, 1]])
+    M = np.diag([2.0, 2.0, 0.0])
+    first = sysid.Structure(M, K, [0.012, 0.01], n_base=1)
+    factor = (4.0 / first.natural_frequencies[0]) ** 2
+    return sysid.Structure(M, factor * K, [0.012, 0.01], n_base=1)
+
+
+def test_without_any_change_a_law_moves_as_the_linear_mode(linear):
+    u = load()[None]
+    plain, followed = linear.simulate(u, RATE), linear.with_laws([law(0.0, 0.0)]).simulate(u, RATE)
+    assert np.linalg.norm(followed - plain) < 2e-3 * np.linalg.norm(plain - u)
+    assert np.linalg.norm(linear.with_laws([law()]).simulate(u, RATE) - plain) > 0.05 * np.linalg.norm(plain - u)
+
+
+def test_at_a_level_the_mode_has_the_frequency_and_damping_of_the_law(linear):
+    there = linear.with_laws([law()]).at_level(5.0)
+    frequency, ratio = law().at(5.0)
+    assert frequency == pytest.approx(4.0 * (1 - 0.03 * np.sqrt(0.25)), rel=1e-9)
+    assert ratio == pytest.approx(0.012 + 0.01 * 0.25, rel=1e-9)
+    assert there.natural_frequencies[0] == pytest.approx(frequency, rel=1e-9)
+    assert there.damping_ratios[0] == pytest.approx(ratio, rel=1e-9)
+    assert there.natural_frequencies[1] == pytest.approx(linear.natural_frequencies[1], rel=1e-9)
+    assert np.array_equal(there.mass, linear.mass)
+    assert np.allclose(there.participation, linear.participation)
+    assert there.laws == ()
+
+
+def test_a_stored_structure_keeps_its_laws(linear):
+    again = sysid.Structure.from_tree(linear.with_laws([law()]).to_tree())
+    (found,) = again.laws
+    assert found.at(3.0) == law().at(3.0)
+    assert found.levels == law().levels
+    assert np.array_equal(found.covariance, law().covariance)
+
+
+def test_deviations_are_those_of_draws():
+    rng = np.random.default_rng(0)
+    covariance = np.diag([1e-4, 1e-3, 2e-3, 1e-3]) ** 2
+    one = FittedLaw(4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([0.03, 0.01]), (0.1, 20.0), covariance)
+    draws = rng.multivariate_normal(np.concatenate([np.log([4.0, 0.012]), one.values]), covariance, 4000)
+    seen = np.exp(draws[:, 0]) * (1 - draws[:, 2] * np.sqrt(5.0 / 20.0))
+    assert one.deviations_at(5.0)[0] == pytest.approx(seen.std(), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"modes": []}, {"modes": [0]}, {"modes": [1, 1]}, {"exponents": (0.7, 1.0)}, {"exponents": "best"}]
+)
+def test_a_law_that_is_none_is_refused(wrong):
+    with pytest.raises(sysid.InputError, match="AmplitudeLaw"):
+        sysid.AmplitudeLaw(**wrong)
