@@ -12,7 +12,7 @@ from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.modal_model import ModeLaw
-from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, unit_diagonal
+from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, rough_levels, unit_diagonal
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import ComplexArray
@@ -62,9 +62,11 @@ def _with_laws(
     if stated.exponents == "auto":
         best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
         best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
-    if plain and not fit.model.whole.plain and left_of(best) < much:
+    if plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
-        best = refitted(replace(best, test=fit.test, levels=fit.levels), best.parameters, monitor=monitor)
+        p, whole = best.parameters, replace(whole, plain=False)
+        best = replace(best, test=replace(best.test, whole=whole))
+        best = refitted(replace(best, levels=rough_levels(best.model_of(p), p)), p, monitor=monitor)
         monitor.keep_instead(best)
     return best
 

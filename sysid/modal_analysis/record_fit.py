@@ -303,7 +303,7 @@ def _fit(
     elif stated is not None:
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
-        levels = _rough_levels(model, p)
+        levels = rough_levels(model, p)
     settled, chi2, equations = False, np.inf, _Equations(model, coarse)
     for round_ in range(limits.rounds):
         p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), equations)
@@ -445,7 +445,7 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
     return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, trace_count(test))))
 
 
-def _rough_levels(model: RecordModel, p: Parameters) -> Array:
+def rough_levels(model: RecordModel, p: Parameters) -> Array:
     """Variances to begin with: what the first model leaves of the outputs, and the same share of the base."""
     power = np.zeros((3, len(model.runs), model.channels + model.d))  # of errors and records; numbers of lines
     for chunk in model.chunks(p):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 import sysid
 from sysid.modal_analysis.modal_model import ModeLaw
@@ -18,10 +19,10 @@ STEPS = 12  # of a sample
 
 
 def moved(base, *, law=True):
-    """Absolute accelerations by a Runge-Kutta method of fourth order, the base straight from sample to sample."""
+    """Absolute accelerations by a Runge-Kutta method of fourth order, the base band-limited."""
     n = base.size * STEPS
-    fine = np.interp(np.arange(n) / STEPS, np.arange(base.size), base)
-    middle = np.interp((np.arange(n) + 0.5) / STEPS, np.arange(base.size), base)
+    both = scipy.signal.resample(base, 2 * n)
+    fine, middle = both[::2], both[1::2]
     h, size = 1 / (RATE * STEPS), np.abs(PHI[:, 0]).max()
 
     def slope(y, u):

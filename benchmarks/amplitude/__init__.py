@@ -1,0 +1,1 @@
+"""Structures whose modes change with amplitude."""

@@ -1,0 +1,71 @@
+"""Structures that change with amplitude: unseen runs predicted, laws found, linear structures called linear."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+import sysid
+from benchmarks.amplitude.softening_storeys import AT, BAND, FALL, RATE, RISE, Array, Kind, recorded, shaken, storeys
+from benchmarks.line import Line, above, below
+
+LEVELS = (0.3, 1.0, 3.0)  # m/s² rms of the base
+NOISE = 0.01
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """40 structures of three kinds, 60 linear ones, 20 tests that leave a law open; reduced: one, one and one."""
+    seconds = 25.0 if reduced else 60.0
+    kinds: list[Kind] = ["law", "duffing", "friction"]
+    predicted, off = [], []
+    for seed in range(1 if reduced else 40):
+        ratio, deviations = _predicted(kinds[seed % 3], seed, seconds)
+        predicted.append(ratio)
+        off += deviations
+    share = float(np.mean(np.array(predicted) <= 0.5))
+    yield above(
+        f"unseen runs of {len(predicted)} structures: share missed at most half as much as by the best linear model "
+        f"(largest {max(predicted):.2g})", share, 0.95,
+    )  # fmt: skip
+    if off:
+        rms = float(np.sqrt(np.mean(np.square(off))))
+        yield below(f"stated laws: rms of {len(off)} errors over their deviations", rms, 2.0 if reduced else 1.2)
+    linear = [_kinds("linear", seed, LEVELS, seconds) for seed in range(1 if reduced else 60)]
+    yield above("linear structures called linear: share", float(np.mean([k == "linear" for k in linear])), 59 / 60)
+    open_ = [_kinds("linear", 100 + seed, (0.3,), 8.0, noise=0.3) for seed in range(1 if reduced else 20)]
+    yield above("one level, one short run: called open: share", float(np.mean([k == "amplitude open" for k in open_])), 1)
+
+
+def _predicted(kind: Kind, seed: int, seconds: float) -> tuple[float, list[float]]:
+    """Error for an unseen run over that of the linear model; errors of a stated law over their deviations."""
+    rng = np.random.default_rng(seed)
+    structure = storeys(kind, rng, 3 + seed % 4 if seconds > 30 else 2)
+    runs = [(base, structure.under(base)) for base in (shaken(level, seconds, rng) for level in (*LEVELS, 1.7))]
+    test, (base, truth) = recorded(runs[:3], NOISE, rng), runs[3]
+    unseen = recorded([(base, truth)], 0.0, rng)
+    plain = sysid.identify(sysid.Problem(test), rng=0)
+    result = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw()), rng=0)
+    missed = [np.linalg.norm(one.predict(unseen) - unseen.relative) for one in (result, plain)]
+    if kind != "law" or not result.structure.laws:
+        return float(missed[0] / missed[1]), []
+    (law,) = result.structure.laws
+    if law.form[:2] != (0.5, 1.0):
+        return float(missed[0] / missed[1]), []
+    scale = AT / law.form.level
+    w, _ = structure.modes
+    truth_of = np.array([*np.log([w[0] / (2 * np.pi), structure.ratios[0]]), FALL / np.sqrt(scale), RISE / scale])
+    found = np.array([*np.log([law.frequency, law.ratio]), *law.values])
+    return float(missed[0] / missed[1]), list((found - truth_of) / np.sqrt(np.diag(law.covariance)))
+
+
+def _kinds(kind: Kind, seed: int, levels: tuple[float, ...], seconds: float, noise: float = NOISE) -> str:
+    """What the answer calls the first mode."""
+    rng = np.random.default_rng(1000 + seed)
+    structure = storeys(kind, rng, 2)
+    runs: list[tuple[Array, Array]] = [
+        (base, structure.under(base)) for base in (shaken(level, seconds, rng) for level in levels)
+    ]
+    law = sysid.AmplitudeLaw(exponents=(0.5, 0.5))
+    result = sysid.identify(sysid.Problem(recorded(runs, noise, rng), amplitude=law), rng=0)
+    return next(one.kind for one in result.findings if one.kind in ("linear", "amplitude law", "amplitude open"))
