@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import sysid
-from benchmarks.amplitude.softening_storeys import AT, BAND, FALL, RATE, RISE, Array, Kind, recorded, shaken, storeys
+from benchmarks.amplitude.softening_storeys import AT, FALL, RISE, Array, Kind, recorded, shaken, storeys
 from benchmarks.line import Line, above, below
 
 LEVELS = (0.3, 1.0, 3.0)  # m/s² rms of the base
@@ -34,7 +34,9 @@ def lines(reduced: bool) -> Iterator[Line]:
     linear = [_kinds("linear", seed, LEVELS, seconds) for seed in range(1 if reduced else 60)]
     yield above("linear structures called linear: share", float(np.mean([k == "linear" for k in linear])), 59 / 60)
     open_ = [_kinds("linear", 100 + seed, (0.3,), 8.0, noise=0.3) for seed in range(1 if reduced else 20)]
-    yield above("one level, one short run: called open: share", float(np.mean([k == "amplitude open" for k in open_])), 1)
+    yield above(
+        "one level, one short run: called open: share", float(np.mean([k == "amplitude open" for k in open_])), 1
+    )
 
 
 def _predicted(kind: Kind, seed: int, seconds: float) -> tuple[float, list[float]]:

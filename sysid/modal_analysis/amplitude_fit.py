@@ -6,16 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import modes_within
-from sysid.modal_analysis.modal_model import ModeLaw
+from sysid.modal_analysis.modal_model import ModeLaw, Parameters
 from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, rough_levels, unit_diagonal
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
-from sysid.structure.structure import ComplexArray
+from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EPSILON, ROUND_OFF
 
 
@@ -64,7 +65,7 @@ def _with_laws(
         best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
     if plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
-        p, whole = best.parameters, replace(whole, plain=False)
+        p, whole = _with_equivalents(best), replace(whole, plain=False)
         best = replace(best, test=replace(best.test, whole=whole))
         best = refitted(replace(best, levels=rough_levels(best.model_of(p), p)), p, monitor=monitor)
         monitor.keep_instead(best)
@@ -95,13 +96,13 @@ def _begun(
         for k in own:
             sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
             form = LawForm(*exponents, _levels(linear, k, sensor)[1])
-            laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0])))
+            laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0]), np.ones((linear.test.n_runs, 2))))
         modes = p.modes._replace(
             omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), own), 1 + fall / 2, 1)
         )
         found.append(refitted(linear, replace(p, modes=modes, laws=tuple(laws)), limits=ROUGH, monitor=monitor))
     best = max(found, key=lambda one: one.likelihood)
-    return refitted(best, best.parameters, monitor=monitor)
+    return refitted(best, _with_equivalents(best), monitor=monitor)
 
 
 def _likeliest(
@@ -110,7 +111,7 @@ def _likeliest(
     """The likeliest of a fit and of those with other exponents, from what its laws say at the highest level."""
     for exponent in exponents:
         monitor.doing = f"a law of amplitude, exponent {exponent:g} {which.replace('_', ' ')}"
-        p = best.parameters
+        p = _with_equivalents(best)
         laws = tuple(law._replace(form=law.form._replace(**{which: exponent})) for law in p.laws)
         found = refitted(best, replace(p, laws=laws), monitor=monitor)
         if found.likelihood > best.likelihood:
@@ -129,8 +130,33 @@ def _white_errors(fit: RecordFit) -> ComplexArray:
     return left
 
 
+def _with_equivalents(fit: RecordFit) -> Parameters:
+    """The parameters with the linear mode of each run that is nearest to what its law does there.
+
+    Frequency and damping are means over the time, each weighed by the square of the level.
+    """
+    p, laws = fit.parameters, []
+    for law in p.laws:
+        omega, ratio = float(p.modes.omega[law.mode]), float(p.modes.ratios[law.mode])
+        A = ca.SX.sym("A")
+        both = law.form.at(A, ca.SX(omega), ca.SX(ratio), ca.SX(ca.DM(law.values)))
+        function = ca.Function("both", [A], [ca.horzcat(*both) / np.array([[omega, ratio]])])
+        equivalent = []
+        for level in _envelopes(fit, law.mode, law.sensor):
+            values = np.asarray(function.map(level.size)(level[None]).full()).reshape(2, -1, order="F")
+            equivalent.append(values @ level**2 / (level @ level))
+        laws.append(law._replace(equivalent=np.maximum(equivalent, 0.1)))
+    return replace(p, laws=tuple(laws))
+
+
 def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tuple[float, float]:
-    """Level that a mode exceeds but for a `share` of the time, and its highest, m/s²: of the linear mode."""
+    """Level that a mode exceeds but for a `share` of the time, and its highest, m/s²."""
+    level = np.concatenate(_envelopes(fit, mode, sensor))
+    return float(np.quantile(level, share)), float(level.max())
+
+
+def _envelopes(fit: RecordFit, mode: int, sensor: int) -> list[Array]:
+    """Level of a mode at a sensor at all samples of each run, m/s²."""
     whole, parts = fit.model.whole, []
     for number, samples in enumerate(whole.samples):
         spectrum = np.zeros(samples, complex)
@@ -138,9 +164,9 @@ def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tupl
             if chunk.run.number == number:
                 at = np.round(chunk.run.w / (2 * np.pi) * samples / whole.sample_rate).astype(int)
                 spectrum[at] = 2 * chunk.motion[mode]  # analytic: its modulus is the envelope
-        parts.append(np.abs(np.fft.ifft(spectrum)) * whole.sample_rate)
-    level = np.concatenate(parts) * abs(fit.parameters.modes.phi[sensor, mode])
-    return float(np.quantile(level, share)), float(level.max())
+        size = abs(fit.parameters.modes.phi[sensor, mode]) * whole.sample_rate
+        parts.append(np.abs(np.fft.ifft(spectrum)) * size)
+    return parts
 
 
 def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:

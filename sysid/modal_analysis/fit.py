@@ -389,11 +389,12 @@ def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw, monitor: FitMon
 
 
 def without_transients(fit: RecordFit) -> Measurement:
-    """The records as they would be at rest at both ends, with their noise stated."""
+    """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
     test, model, p = fit.test, fit.model, fit.parameters
     free: list[list[ComplexArray]] = [[] for _ in range(test.n_runs)]
     for chunk in model.chunks(p):
-        predicted = np.einsum("cdl,dl->cl", chunk.H, chunk.run.base)
+        at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
+        predicted = np.einsum("cdl,dl->cl", at_rest.H, chunk.run.base)
         free[chunk.run.number].append(chunk.run.outputs - chunk.error - predicted)
     taken = _at_lines(test, free)
     n = test.n_sensors

@@ -106,7 +106,8 @@ class LawMotions:
         rows = motion(law.form, gamma @ series, step, numbers, ends[::-1], series)
         spectra = np.fft.rfft(rows[:, ::times])[:, self.places(run)] / self.rate
         w, base = 2 * np.pi * self.lines[run], self.base[run]
-        g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], modes.omega[[k]], modes.ratios[[k]])
+        pole = np.array([[omega], [ratio]]) * law.equivalent[run][:, None]
+        g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], *pole)
         transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
         load = gamma @ base + ends @ transients
         here = spectra[0] - gamma @ base
@@ -142,7 +143,8 @@ def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray
         structure.mode_shapes, structure.participation, 2 * np.pi * structure.natural_frequencies,
         structure.damping_ratios,
     )  # fmt: skip
-    laws = tuple(ModeLaw(structure.mode_of(law), law.sensor, law.form, law.values) for law in structure.laws)
+    ones = np.ones((test.n_runs, 2))
+    laws = tuple(ModeLaw(structure.mode_of(law), law.sensor, law.form, law.values, ones) for law in structure.laws)
     motions = LawMotions(test)
     ends = np.zeros((structure.n, 2 * sum(not rest for rest in motions.at_rest)))
     p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)

@@ -143,12 +143,17 @@ class Moves(NamedTuple):
 
 
 class ModeLaw(NamedTuple):
-    """A mode that follows its amplitude at a sensor, both by number, the form of its law and the law's numbers."""
+    """A mode that follows its amplitude at a sensor, both by number, the form of its law and the law's numbers.
+
+    `equivalent`, (runs, 2), is by what frequency and damping ratio are multiplied for the linear mode that noise of the
+    base moves in each run.
+    """
 
     mode: int
     sensor: int
     form: LawForm
     values: Array
+    equivalent: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +267,7 @@ class Lines:
     def __init__(self, model: SpectralModel, p: Parameters, run: Run) -> None:
         self.model, self.p, self.run = model, p, run
         freq = run.w / (2 * np.pi)
-        modes = p.modes
+        modes = self.modes = self.linear_modes(p, run)
         self.g = gains(freq, modes.omega, modes.ratios)
         self.shapes = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
         self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
@@ -278,6 +283,10 @@ class Lines:
         self.trace_spectra = model.trace_spectra(freq)
         self.motion = self.motion_of(run.base)
         self.error = run.outputs - self.predicted(run.base, self.motion)
+
+    def linear_modes(self, p: Parameters, run: Run) -> Modes:
+        """The modes by which noise of the base moves the structure."""
+        return p.modes
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
         """Motions of the modes that this of the base makes, (m, L)."""
@@ -359,7 +368,7 @@ class Lines:
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """Spectra of which all columns of the Jacobian are made, (spectra, L)."""
-        modes, g = self.p.modes, self.g
+        modes, g = self.modes, self.g
         freq = self.run.w / (2 * np.pi)
         parts = [
             motion_and_slopes(freq, modes.omega, modes.ratios, modes.gamma, base, self.pushed_by_ends),

@@ -195,7 +195,7 @@ class RecordFit:
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
         laws = tuple(
-            ModeLaw(law["mode"], law["sensor"], LawForm(*law["form"].tolist()), law["values"])
+            ModeLaw(law["mode"], law["sensor"], LawForm(*law["form"].tolist()), law["values"], law["equivalent"])
             for law in tree.get("laws") or ()
         )
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
@@ -210,6 +210,7 @@ class RecordFit:
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
         sound &= all(law.mode in range(m) and law.sensor in range(model.n) for law in laws)
+        sound &= all(law.equivalent.shape == (test.n_runs, 2) and bool(np.all(law.equivalent > 0)) for law in laws)
         sound &= all(law.values.shape == (law.form.size,) and bool(np.all(np.isfinite(law.values))) for law in laws)
         sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))

@@ -403,6 +403,15 @@ class Chunk(Lines):
 class LawChunk(Chunk):
     """The same with modes that follow their amplitude: to motions and columns comes what their laws add."""
 
+    def linear_modes(self, p: Parameters, run: Run) -> Modes:
+        """See `Lines`."""
+        modes = p.modes
+        omega, ratios = modes.omega.copy(), modes.ratios.copy()
+        for law in p.laws:
+            omega[law.mode] *= law.equivalent[run.number, 0]
+            ratios[law.mode] *= law.equivalent[run.number, 1]
+        return modes._replace(omega=omega, ratios=ratios)
+
     @cached_property
     def added(self) -> list[Addition]:
         """What each law adds."""

@@ -86,7 +86,11 @@ def answer(test):
 def test_the_gradient_of_the_fit_is_that_of_differences(test, form, at_rest):
     test = replace(test, whole=replace(test.whole, at_rest=(at_rest, False)))
     fit = record_modes(test, OMEGA, RATIOS)
-    p, rng = replace(fit.parameters, laws=(ModeLaw(0, 1, form, np.array([0.02, 0.003])),)), np.random.default_rng(1)
+    factors = np.array([[0.98, 1.2], [0.95, 1.4]])
+    p, rng = (
+        replace(fit.parameters, laws=(ModeLaw(0, 1, form, np.array([0.02, 0.003]), factors),)),
+        np.random.default_rng(1),
+    )
     model = fit.model_of(p)
     x, exact = model.pack(p), model.normal_equations(p, fit.levels)
     unit = np.where(model.held, 0.0, 1 / np.sqrt(np.maximum(np.diag(exact.normal), 1e-300)))
