@@ -242,6 +242,19 @@ class Identification(Answer):
             "degrees_of_freedom": list(self.degrees_of_freedom),
             "effective_mass_kg": np.einsum("kii->i", s.effective_masses).tolist(),
             "residual_modes": {"count": s.residual.count, "static": s.residual.static, "share_of_response": share},
+            "amplitude_laws": [
+                {
+                    "mode": s.mode_of(law) + 1,
+                    "sensor": test.sensor_names[law.sensor],
+                    **law.form._asdict(),
+                    "values": law.values.tolist(),
+                    "values_std": np.sqrt(np.diag(law.covariance)[2:]).tolist(),
+                    "levels": list(law.levels),
+                    "frequency_hz": [law.at(level)[0] for level in law.levels],
+                    "damping_ratio": [law.at(level)[1] for level in law.levels],
+                }
+                for law in s.laws
+            ],
         }
 
     def to_tree(self) -> dict[str, Any]:
