@@ -253,3 +253,34 @@ def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> NDArray[np.f
     if array.shape != tuple(lengths.get(length) for length in shape):
         raise InputError(f"{name} has shape {array.shape}; it must be {shape}".replace("'", ""))
     return array
+
+
+def symmetric(name: str, value: ArrayLike, size: int | str, tolerance: float) -> NDArray[np.floating[Any]]:
+    """A symmetric array of this shape; refused where it is none."""
+    array = shaped_array(name, value, size, size)
+    scale = np.sqrt(np.abs(np.diag(array)))
+    asymmetry = np.abs(array - array.T)
+    if np.any(asymmetry > tolerance * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
+        i, j = np.unravel_index(int(np.argmax(asymmetry)), array.shape)
+        raise InputError(
+            f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}"
+        )
+    return (array + array.T) / 2
+
+
+def check_positive_definite(name: str, matrix: NDArray[np.floating[Any]]) -> None:
+    """Refuse a matrix that is not positive definite."""
+    diagonal = np.diag(matrix)
+    if np.any(diagonal <= 0):
+        at = int(np.argmin(diagonal))
+        raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
+    lowest = lowest_eigenvalue(matrix)
+    if lowest <= 10 * len(matrix) * np.finfo(float).eps:  # below that a factorisation finds only round-off
+        raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")
+
+
+def lowest_eigenvalue(matrix: NDArray[np.floating[Any]]) -> float:
+    """Lowest eigenvalue with each row in units of its own diagonal, so that kg and kg m² can be judged together."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale[scale == 0] = scale.max()
+    return float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])

@@ -16,7 +16,6 @@ from sysid.assessment.checks.mistakes import check_records
 from sysid.assessment.checks.model_error import changing
 from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
 from sysid.finding import Finding
-from sysid.modal_analysis.fit import fit_tests
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared, clocks_of
 from sysid.problem.problem import Problem
@@ -121,8 +120,7 @@ def prepare(problem: Prepared, session: Session) -> None:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     try:
         with session.fit_monitor() as monitor:
-            problem.modal = fit_tests(zip(problem.stated.tests, problem.delays, strict=True), monitor)
-            problem.follow_amplitude(monitor)
+            problem.fit_modes(monitor)
         if any(one.by_modes for one in problem.modal):
             session.finish()
         problem.prepare(session.preparing)

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse
-from sysid.measurement.clocks import without_delays
 from sysid.measurement.in_time import as_whole
-from sysid.measurement.measurement import Measurement
+from sysid.measurement.measurement import Measurement, without_delays
 from sysid.measurement.whole import factors_of_runs
 from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_poles, beside_poles_at
 from sysid.modal_analysis.least_squares import units_of

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
-from sysid.measurement.clocks import without_delays
-from sysid.measurement.measurement import Measurement
+from sysid.measurement.measurement import Measurement, without_delays
 from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings

@@ -7,6 +7,7 @@ linear mode and what the law adds, and so is every derivative.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,6 +117,50 @@ class LawMotions:
             here - g[0] * load, by_ends - g[0] * transients, spectra[3 : 3 + d] - base - g[0] * base,
             spectra[3 + d] - by_omega * load, spectra[4 + d] - by_ratio * load, spectra[5 + d], spectra[6 + d :],
         )  # fmt: skip
+
+
+def linear_modes(p: Parameters, run: int) -> Modes:
+    """The modes by which noise of the base moves the structure in a run: those with a law at its equivalent pole."""
+    omega, ratios = p.modes.omega.copy(), p.modes.ratios.copy()
+    for law in p.laws:
+        omega[law.mode] *= law.equivalent[run, 0]
+        ratios[law.mode] *= law.equivalent[run, 1]
+    return p.modes._replace(omega=omega, ratios=ratios)
+
+
+def add_laws(
+    plain: ComplexArray, laws: Sequence[ModeLaw], additions: Sequence[Addition], d: int, first: Array, *, ends: bool
+) -> list[ComplexArray]:
+    """Add what laws add to the spectra of the linear modes, in place; give derivatives by size and law, law by law.
+
+    `first` are the places of motions, of derivatives by gamma, log omega and log zeta, of the base and of the ends.
+    """
+    beside = []
+    for law, added in zip(laws, additions, strict=True):
+        k = law.mode
+        plain[k] += added.motion
+        plain[first[1] + k * d : first[1] + (k + 1) * d] += added.by_gamma
+        plain[first[2] + k] += added.by_omega
+        plain[first[3] + k] += added.by_ratio
+        if ends:
+            plain[first[5] + 2 * k : first[5] + 2 * k + 2] += added.by_ends
+        beside += [added.by_size[None], added.by_law]
+    return beside
+
+
+def law_entries(
+    p: Parameters, of_shapes: int, of_laws: int, at: int, shapes: Array
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+    """Entries of a channel's columns by the spectra that `add_laws` gives, which begin at `at`.
+
+    Shapes and numbers of the laws begin at these unknowns; `shapes`, (m,), are the channel's.
+    """
+    for law in p.laws:
+        size, shape = law.form.size, shapes[law.mode]
+        of_size = of_shapes + law.sensor * p.modes.omega.size + law.mode
+        yield np.array([of_size]), np.array([at]), np.array([shape / p.modes.phi[law.sensor, law.mode]])
+        yield of_laws + np.arange(size), at + 1 + np.arange(size), np.full(size, shape)
+        of_laws, at = of_laws + size, at + 1 + size
 
 
 def _clock_of(test: Measurement) -> tuple[float, tuple[int, ...], tuple[bool, ...]]:

@@ -25,7 +25,6 @@ from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.noise_levels import bounded_by_lines, floors, likeliest_levels, plain_levels
 from sysid.modal_analysis.record_model import (
     TRACES,
-    HeldShapes,
     NormalEquations,
     Parameters,
     RecordModel,
@@ -49,7 +48,7 @@ class Limits(NamedTuple):
     steps: int
 
 
-WHOLE, TRIAL, ROUGH, _POLES = Limits(12, 60), Limits(12, 8), Limits(3, 4), Limits(1, 20)
+WHOLE, TRIAL, ROUGH = Limits(12, 60), Limits(12, 8), Limits(3, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +230,7 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Fit
     """
     first = _first(test, omega, ratios)
     model = RecordModel(test, first.modes.omega.size)
-    return _fit(model, first, None, monitor or FitMonitor(), ROUGH)
+    return fit_model(model, first, None, monitor or FitMonitor(), ROUGH)
 
 
 def refitted(
@@ -250,18 +249,7 @@ def refitted(
     """
     fit = fit if static is None else replace(fit, static=static)
     coarse = None if some is None else fit.model_of(p, some).weighed_as_all()
-    return _fit(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
-
-
-def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
-    """Poles, transients and levels of a test of one run, with the shapes of a fit of others; or, `held`, its poles too.
-
-    Poles that leave the records unexplained are not looked for far away: a few steps are taken.
-    """
-    m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
-    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, trace_count(test))), laws=())
-    model = HeldShapes(test, m, poles=held, static=fit.static, coupled=first.coupling is not None)
-    return _fit(model, first, None, FitMonitor(), _POLES)
+    return fit_model(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
@@ -283,11 +271,11 @@ def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None =
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
     """The same in one step, with levels and sum of squares of all lines; settled where the fit of some lines was."""
     model, coarse = fit.model_of(fit.parameters, test), fit.model_of(fit.parameters).weighed_as_all()
-    one = _fit(model, fit.parameters, fit.levels, FitMonitor(), Limits(1, 1), coarse)
+    one = fit_model(model, fit.parameters, fit.levels, FitMonitor(), Limits(1, 1), coarse)
     return replace(one, settled=fit.settled)
 
 
-def _fit(
+def fit_model(
     model: RecordModel,
     p: Parameters,
     levels: Array | None,

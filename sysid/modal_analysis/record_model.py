@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.gains import read_by_gains
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.law_spectra import Addition, LawMotions
+from sysid.modal_analysis.law_spectra import Addition, LawMotions, add_laws, law_entries, linear_modes
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
     FAR,
@@ -129,11 +129,8 @@ class RecordModel(SpectralModel):
 
     def weighed_as_all(self) -> RecordModel:
         """The same, each line of a coarse test standing for those around it that were left out."""
-        other = copy(self)
-        other.runs = [
-            run._replace(weight=np.gradient(run.w) / (2 * np.pi * self.whole.spacing[run.number])) for run in self.runs
-        ]
-        return other
+        spacing = 2 * np.pi * self.whole.spacing
+        return self.weighed_by([np.gradient(run.w) / spacing[run.number] for run in self.runs])
 
     def weighed_by(self, weights: Sequence[Array]) -> RecordModel:
         """The same, each line of each run standing for so many."""
@@ -253,30 +250,6 @@ class RecordModel(SpectralModel):
         if np.any(self.held):
             normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
         return NormalEquations(normal, gradient, chi2)
-
-
-class HeldShapes(RecordModel):
-    """The same with shapes, participations and rigid-body mass held, and with `poles` these too.
-
-    What is left to be found are poles, transients and traces.
-    """
-
-    def __init__(
-        self, test: Measurement, m: int, *, poles: bool = False, static: int = 0, coupled: bool = False
-    ) -> None:
-        super().__init__(test, m, static=static, coupled=coupled)
-        self.held[: self.index.log_omega.start], self.held[self.index.log_ratios.stop : self.kept] = True, True
-        self.held[self.coupling] = True
-        self.held[self.index.log_omega.start : self.index.log_ratios.stop] |= poles
-
-    def scales(self, p: Parameters) -> Array:
-        """See `RecordModel`: with shapes held there are none."""
-        return np.zeros((0, self.size))
-
-    @property
-    def unknowns(self) -> int:
-        """Numbers that are not held."""
-        return int(np.sum(~self.held))
 
 
 class Chunk(Lines):
@@ -405,19 +378,14 @@ class LawChunk(Chunk):
 
     def linear_modes(self, p: Parameters, run: Run) -> Modes:
         """See `Lines`."""
-        modes = p.modes
-        omega, ratios = modes.omega.copy(), modes.ratios.copy()
-        for law in p.laws:
-            omega[law.mode] *= law.equivalent[run.number, 0]
-            ratios[law.mode] *= law.equivalent[run.number, 1]
-        return modes._replace(omega=omega, ratios=ratios)
+        return linear_modes(p, run.number)
 
     @cached_property
     def added(self) -> list[Addition]:
         """What each law adds."""
-        model, p = self.records, self.p
-        assert model.law_motions is not None
-        return [model.law_motions.added(p, self.run, law) for law in range(len(p.laws))]
+        motions = self.records.law_motions
+        assert motions is not None
+        return [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
         """See `Lines`."""
@@ -430,32 +398,16 @@ class LawChunk(Chunk):
         """See `Chunk`; last, law by law, come derivatives by the logarithm of the size of the shape, and by the law."""
         plain, m, d = super().spectra(base), self.records.m, self.records.d
         first = np.cumsum([0, m, m * d, m, m, d])  # of q, by gamma, by log omega, by log zeta, u; then ends
-        last = []
-        for law, added in zip(self.p.laws, self.added, strict=True):
-            k = law.mode
-            plain[k] += added.motion
-            plain[first[1] + k * d : first[1] + (k + 1) * d] += added.by_gamma
-            plain[first[2] + k] += added.by_omega
-            plain[first[3] + k] += added.by_ratio
-            if self.at_ends is not None:
-                plain[first[5] + 2 * k : first[5] + 2 * k + 2] += added.by_ends
-            last += [added.by_size[None], added.by_law]
+        last = add_laws(plain, self.p.laws, self.added, d, first, ends=self.at_ends is not None)
         return np.concatenate([plain, *last])
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """See `Chunk`."""
         yield from super().entries(channel)
-        model, p = self.records, self.p
-        d = model.d
+        model, d = self.records, self.records.d
         at = 3 * model.m + model.m * d + d + len(self.trace_spectra) + (2 * d + model.channels) * model.gains
         at += 0 if self.at_ends is None else 2 * model.m
-        own = model.of_laws.start
-        for law in self.p.laws:
-            size, shape = law.form.size, self.shapes[channel, law.mode]
-            of_size = model.index.phi.start + law.sensor * model.m + law.mode
-            yield np.array([of_size]), np.array([at]), np.array([shape / p.modes.phi[law.sensor, law.mode]])
-            yield own + np.arange(size), at + 1 + np.arange(size), np.full(size, shape)
-            own, at = own + size, at + 1 + size
+        yield from law_entries(self.p, model.index.phi.start, model.of_laws.start, at, self.shapes[channel])
 
 
 class CoupledChunk(Chunk):

@@ -6,6 +6,7 @@ participations are those of all stretches of a test together; poles are fitted t
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,39 @@ from sysid.measurement.in_time import RunInTime, runs_in_time
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import TimeRun
 from sysid.measurement.whole import NoiseLevels, WholeRecords
-from sysid.modal_analysis.record_fit import RecordFit, record_modes, with_poles_of
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.modal_model import Parameters
+from sysid.modal_analysis.record_fit import Limits, RecordFit, fit_model, record_modes
+from sysid.modal_analysis.record_model import RecordModel, trace_count
 from sysid.structure.structure import Array
 
 _PERIODS = 25  # of the lowest mode, that a stretch holds at least
 _LEAST = 1e-3  # of the sensor that moves most: how much of the motion of one that hardly moves counts in full
 _FEWEST = 8  # lines of a stretch for each mode
+
+
+class HeldShapes(RecordModel):
+    """The same with shapes, participations and rigid-body mass held, and with `poles` these too.
+
+    What is left to be found are poles, transients and traces.
+    """
+
+    def __init__(
+        self, test: Measurement, m: int, *, poles: bool = False, static: int = 0, coupled: bool = False
+    ) -> None:
+        super().__init__(test, m, static=static, coupled=coupled)
+        self.held[: self.index.log_omega.start], self.held[self.index.log_ratios.stop : self.kept] = True, True
+        self.held[self.coupling] = True
+        self.held[self.index.log_omega.start : self.index.log_ratios.stop] |= poles
+
+    def scales(self, p: Parameters) -> Array:
+        """See `RecordModel`: with shapes held there are none."""
+        return np.zeros((0, self.size))
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that are not held."""
+        return int(np.sum(~self.held))
 
 
 class Stretch(NamedTuple):
@@ -91,7 +119,7 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
 
 def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     """Poles of one stretch, with the shapes of all."""
-    fit, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
+    fit, held = _with_poles_of(every, test), _with_poles_of(every, test, held=True)
     modes, index, model = fit.parameters.modes, fit.model.index, fit.model
     free = np.r_[index.log_omega, index.log_ratios, model.kept : model.size]
     N = fit.normal[np.ix_(free, free)]
@@ -175,3 +203,14 @@ def _as_test(
         *given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole,
         gain_std=np.zeros(test.n_sensors),
     )  # fmt: skip
+
+
+def _with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
+    """Poles, transients and levels of a test of one run, with the shapes of a fit of others; or, `held`, its poles too.
+
+    Poles that leave the records unexplained are not looked for far away: a few steps are taken.
+    """
+    m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
+    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, trace_count(test))), laws=())
+    model = HeldShapes(test, m, poles=held, static=fit.static, coupled=first.coupling is not None)
+    return fit_model(model, first, None, FitMonitor(), Limits(1, 20))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
+from sysid.errors import InputError, choice, finite_array, lowest_eigenvalue, numbers, refuse, shown
 from sysid.models.expressions import at_point, check_base_last, lower_triangle, triangle_entries
 from sysid.models.model import (
     FACTOR_FLOOR,
@@ -25,7 +25,7 @@ from sysid.models.model import (
     constant,
 )
 from sysid.models.unknowns import Unknown
-from sysid.structure.structure import Array, Structure, lowest_eigenvalue
+from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
 

@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
-from sysid.measurement.clocks import without_delays
-from sysid.measurement.measurement import Measurement
+from sysid.measurement.measurement import Measurement, without_delays
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
-from sysid.modal_analysis.fit import estimate, fit_modes, follow_amplitude
+from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests, follow_amplitude
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
@@ -246,8 +245,9 @@ class Prepared(SearchSpace):
             laws, modal = self.modal[0].laws, estimate(more, self.modal[0].calibration)
             self.modal = (modal if modal.laws else replace(modal, laws=laws), *self.modal[1:])
 
-    def follow_amplitude(self, monitor: FitMonitor) -> None:
-        """Fit the laws that are asked for to the problem's own whole records."""
+    def fit_modes(self, monitor: FitMonitor) -> None:
+        """Fit the modes of each test, and the laws that are asked for to the problem's own whole records."""
+        self.modal = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor)
         if self.stated.amplitude is not None:
             monitor.begin(1)
             modal = follow_amplitude(self.modal[0], self.stated.amplitude, monitor)

@@ -61,7 +61,7 @@ class StatedProblem:
         flag("Problem: residual_modes", self.residual_modes)
         if self.amplitude is not None:
             instance("Problem: amplitude", self.amplitude, AmplitudeLaw)
-        own, whole = self.misfit is not None, self.measurement.whole is not None
+        own = self.misfit is not None
         refuse(
             (
                 own and self.loss == "huber",
@@ -69,7 +69,7 @@ class StatedProblem:
             ),
             (own and self.residual_modes, "Problem: residual_modes=True is of records, not of a misfit of one's own"),
             (
-                self.amplitude is not None and (own or not whole),
+                self.amplitude is not None and (own or not self.measurement.is_whole),
                 "Problem: amplitude is of modes of whole records (Measurement.from_time, estimator='records'), and "
                 + ("this problem fits a misfit of its own" if own else "this test holds spectra"),
             ),

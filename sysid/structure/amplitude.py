@@ -147,6 +147,12 @@ class FittedLaw:
         w, zeta = self.form.at(ca.SX(level), ca.SX(self.frequency), ca.SX(self.ratio), ca.SX(ca.DM(self.values)))
         return float(w), float(zeta)
 
+    def changes_at(self, level: float, omega: float, ratio: float) -> tuple[float, float]:
+        """``w² - w0²`` and ``2 (zeta w - zeta0 w0)`` at a level, of a mode of `omega`, rad/s, and `ratio` at rest."""
+        frequency, damping = self.at(level)
+        w, zeta = omega * frequency / self.frequency, ratio + damping - self.ratio
+        return w**2 - omega**2, 2 * (zeta * w - ratio * omega)
+
     def change(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Relative change of the frequency, and change of the damping ratio, over the levels, with their deviations."""
         x = ca.SX.sym("x", 2 + self.values.size)
@@ -269,17 +275,19 @@ def motion(
     return np.asarray(rows.full()).reshape(load.size, -1).T
 
 
-def in_time(
-    law: FittedLaw, numbers: Array, load: Array, rate: float, initial: Array, per_period: float = 96.0
-) -> Array:
+def modal_acceleration(
+    law: FittedLaw, mode: tuple[float, float, float], load: Array, rate: float, initial: Array,
+    per_period: float = 96.0,
+) -> Array:  # fmt: skip
     """Acceleration of a mode that follows a law, at the samples of its load, (n,).
 
     The load, m/s², is the natural spline through its samples, straight over steps of `per_period` in a period.
-    `numbers` and `initial` are those of `motion`.
+    `mode` is of circular frequency, rad/s, damping ratio and shape at the law's sensor; `initial` as in `motion`.
     """
     from scipy.interpolate import make_interp_spline
 
-    times = max(int(np.ceil(per_period * np.exp(numbers[0]) / (2 * np.pi) / rate)), 1)
+    numbers = np.concatenate([np.log(np.abs(mode)), law.values])
+    times = max(int(np.ceil(per_period * mode[0] / (2 * np.pi) / rate)), 1)
     samples = np.arange(load.size)
     fine = make_interp_spline(samples, load, k=3, bc_type="natural")(np.arange((load.size - 1) * times + 1) / times)
     return motion(law.form, fine, 1 / (rate * times), numbers, initial)[::times] - load

@@ -10,11 +10,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, whole_number
-from sysid.structure.amplitude import FittedLaw, in_time, laws_from_tree, laws_to_tree
+from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, symmetric, whole_number
+from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
-from sysid.structure.superelement import CraigBampton, ResidualModes, modal_gains
+from sysid.structure.superelement import CraigBampton, ResidualModes, check_matrices, modal_gains
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -121,8 +121,8 @@ class Structure:
         laws: Sequence[FittedLaw] = (),
     ) -> None:
         self.laws = tuple(laws)
-        self.mass = _symmetric("mass", mass, "n + d")
-        self.stiffness = _symmetric("stiffness", stiffness, "n + d")
+        self.mass = symmetric("mass", mass, "n + d", EXACT)
+        self.stiffness = symmetric("stiffness", stiffness, "n + d", EXACT)
         if self.mass.shape != self.stiffness.shape:
             raise InputError(f"mass is {self.mass.shape} but stiffness is {self.stiffness.shape}; both are (n+d, n+d)")
         size = len(self.mass)
@@ -132,7 +132,7 @@ class Structure:
             raise InputError(
                 f"n_base = {n_base} leaves {n} structural degrees of freedom of {size}; at least one of each is needed"
             )
-        self.rigid_body_dofs: Array = self._check_matrices()
+        self.rigid_body_dofs: Array = check_matrices(self.mass, self.stiffness, n)
 
         lam, phi = scipy.linalg.eigh(self.stiffness[:n, :n], self.mass[:n, :n])
         self._omega = np.sqrt(lam)
@@ -186,16 +186,13 @@ class Structure:
         ``K(A) = K - (w0² - w(A)²) M phi phi' M`` and likewise C: the mass stays. Modes without a law stay too.
         """
         level = as_float("level", level, "m/s², >= 0", at_least=0)
-        K, C, n = self.stiffness.copy(), self.damping.copy(), self.n
-        rigid = np.hstack([np.eye(n), -self.rigid_body_dofs])  # of relative motion
+        K, C = self.stiffness.copy(), self.damping.copy()
         for law in self.laws:
             k = self.mode_of(law)
-            frequency, ratio = law.at(level)
-            w = self._omega[k] * np.array([1.0, frequency / law.frequency])
-            zeta = self.damping_ratios[k] + np.array([0.0, ratio - law.ratio])
-            row = self.normal_modes[:, k] @ self.mass[:n, :n]
-            K += (w[1] ** 2 - w[0] ** 2) * np.outer(row @ rigid, row @ rigid)
-            C += 2 * (zeta[1] * w[1] - zeta[0] * w[0]) * np.outer(row, row)
+            row = self.normal_modes[:, k] @ self.mass[: self.n, : self.n]
+            both = np.append(row, -row @ self.rigid_body_dofs)
+            of_stiffness, of_damping = law.changes_at(level, self._omega[k], self.damping_ratios[k])
+            K, C = K + of_stiffness * np.outer(both, both), C + of_damping * np.outer(row, row)
         tree = {**self.to_tree(), "laws": None, "stiffness": K, "damping_ratios": None, "damping_matrix": C}
         return Structure.from_tree(tree)
 
@@ -390,9 +387,8 @@ class Structure:
         modal = modal_accelerations(self._modal_model, motion, rate, state)
         for law in self.laws:
             k = self.mode_of(law)
-            numbers = np.log([self._omega[k], self.damping_ratios[k], abs(self.mode_shapes[law.sensor, k])])
-            load = self.participation[k] @ motion
-            modal[k] = in_time(law, np.concatenate([numbers, law.values]), load, rate, state[:, k])
+            mode = self._omega[k], self.damping_ratios[k], self.mode_shapes[law.sensor, k]
+            modal[k] = modal_acceleration(law, mode, self.participation[k] @ motion, rate, state[:, k])
         return motion, modal
 
     def to_state_space(self) -> StateSpace:
@@ -453,31 +449,6 @@ class Structure:
         answer = np.linalg.solve(dynamic, w**2 * self._coupling)
         return np.moveaxis(answer, 0, -1).astype(complex, copy=False)
 
-    def _check_matrices(self) -> Array:
-        """Check mass and stiffness; return G of the degrees of freedom."""
-        n = self.n
-        for name, matrix in (("mass", self.mass), ("stiffness", self.stiffness)):
-            _check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
-        lowest = lowest_eigenvalue(self.mass)
-        if lowest < -EXACT:
-            raise InputError(
-                f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
-                "the base rows need M_00 >= M_S0' M_SS^-1 M_S0"
-            )
-        G = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.stiffness[:n, :n]), self.stiffness[:n, n:])
-        expected = G.T @ self.stiffness[:n, :n] @ G
-        size = np.sqrt(np.abs(np.diag(expected)))
-        # A base direction that strains nothing has no stiffness to compare with.
-        allowed = 1e-6 * np.outer(size, size) + 1e-10 * np.max(np.abs(self.stiffness))
-        residue = np.abs(self.stiffness[n:, n:] - expected)
-        if np.any(residue > allowed):
-            worst = 1e-6 * np.max(residue / allowed)
-            raise InputError(
-                f"stiffness does not let the base move as a rigid body: K_00 differs from G' K_SS G by {worst:.3g} "
-                "(relative); K must have the null space [G; I] (are its last n_base rows those of the base?)"
-            )
-        return G
-
     def _set_damping(self, ratios: ArrayLike | None, matrix: ArrayLike | None) -> None:
         n = self.n
         if (ratios is None) == (matrix is None):
@@ -492,7 +463,7 @@ class Structure:
             self.damping: Array = momentum @ modal @ momentum.T
         else:
             assert matrix is not None
-            self.damping = _symmetric("damping_matrix", matrix, n)
+            self.damping = symmetric("damping_matrix", matrix, n, EXACT)
             modal = self.normal_modes.T @ self.damping @ self.normal_modes
             if np.linalg.eigvalsh(modal)[0] < -EXACT * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
@@ -512,32 +483,3 @@ class Structure:
                 f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
             )
         return implied
-
-
-def _symmetric(name: str, value: ArrayLike, size: int | str) -> Array:
-    array = shaped_array(name, value, size, size)
-    scale = np.sqrt(np.abs(np.diag(array)))
-    asymmetry = np.abs(array - array.T)
-    if np.any(asymmetry > EXACT * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
-        i, j = np.unravel_index(int(np.argmax(asymmetry)), array.shape)
-        raise InputError(
-            f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}"
-        )
-    return (array + array.T) / 2
-
-
-def _check_positive_definite(name: str, matrix: Array) -> None:
-    diagonal = np.diag(matrix)
-    if np.any(diagonal <= 0):
-        at = int(np.argmin(diagonal))
-        raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
-    lowest = lowest_eigenvalue(matrix)
-    if lowest <= 10 * len(matrix) * np.finfo(float).eps:  # below that a factorisation finds only round-off
-        raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")
-
-
-def lowest_eigenvalue(matrix: Array) -> float:
-    """Lowest eigenvalue with each row in units of its own diagonal, so that kg and kg m² can be judged together."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale[scale == 0] = scale.max()
-    return float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])

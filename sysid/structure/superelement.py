@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from sysid.errors import refuse, shaped_array
+from sysid.errors import InputError, check_positive_definite, lowest_eigenvalue, refuse, shaped_array
+from sysid.structure.thresholds import EXACT
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
@@ -121,3 +123,28 @@ class CraigBampton:
     stiffness: Array
     damping: Array
     recovery: Array
+
+
+def check_matrices(mass: Array, stiffness: Array, n: int) -> Array:
+    """Check mass and stiffness of a structure of n degrees of freedom; give G of these, (n, d)."""
+    for name, matrix in (("mass", mass), ("stiffness", stiffness)):
+        check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
+    lowest = lowest_eigenvalue(mass)
+    if lowest < -EXACT:
+        raise InputError(
+            f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
+            "the base rows need M_00 >= M_S0' M_SS^-1 M_S0"
+        )
+    G = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(stiffness[:n, :n]), stiffness[:n, n:])
+    expected = G.T @ stiffness[:n, :n] @ G
+    size = np.sqrt(np.abs(np.diag(expected)))
+    # A base direction that strains nothing has no stiffness to compare with.
+    allowed = 1e-6 * np.outer(size, size) + 1e-10 * np.max(np.abs(stiffness))
+    residue = np.abs(stiffness[n:, n:] - expected)
+    if np.any(residue > allowed):
+        worst = 1e-6 * np.max(residue / allowed)
+        raise InputError(
+            f"stiffness does not let the base move as a rigid body: K_00 differs from G' K_SS G by {worst:.3g} "
+            "(relative); K must have the null space [G; I] (are its last n_base rows those of the base?)"
+        )
+    return G

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from benchmarks.records.simulated import Records, Run, four_storeys
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.measurement import without_delays
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles
 from sysid.modal_analysis.fit import whole_fit

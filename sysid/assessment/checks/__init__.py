@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from sysid.assessment.checks import (
     against_records,
-    amplitude,
     brackets,
     damaged_samples,
     gains,
@@ -26,7 +25,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
-    amplitude.laws_of_amplitude,
+    model_error.laws_of_amplitude,
     brackets.soft_brackets,
     stated.stated_masses,
     search_end.missed_goal,
