@@ -21,7 +21,13 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.model_order import least_worth, no_modes, with_further_modes, without_spurious_modes
+from sysid.modal_analysis.model_order import (
+    least_worth,
+    no_modes,
+    peaks_of,
+    with_further_modes,
+    without_spurious_modes,
+)
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     WHOLE,
@@ -221,6 +227,8 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
     """The fit with couplings, then further modes that are worth it, without spurious ones; `some` as in `refitted`."""
     fit = with_couplings(fit, lambda rough: _pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
     monitor.keep(fit)
+    if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
+        return fit  # levels and shares do not explain what is left, and further modes would take long
     monitor.doing = "further modes"
     fit = with_further_modes(fit, some=some, monitor=monitor)
     monitor.doing = "spurious modes"
@@ -338,7 +346,7 @@ def _of_lines(test: Measurement, calibration: Calibration | None, monitor: FitMo
     Where shares of the signal do not explain what is left, a model misses something: then the lines stand as given.
     """
     plain = replace(ModalEstimate.of_lines(test), calibration=calibration)
-    if not may_grow(test):
+    if test.sample_rate is not None or not may_grow(test):  # records in time have noise of a level
         return plain
     try:
         with one_thread(), monitor.at_work():

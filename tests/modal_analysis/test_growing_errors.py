@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.laboratory.stepped_tests import spoiled
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.growing_errors import scatter_of_lines
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.noise_levels import _designs, _likelihood, _parts
@@ -151,17 +153,19 @@ def test_noise_is_drawn_anew_with_the_shares_that_were_found() -> None:
     np.testing.assert_allclose(np.median(modal.own_deviations / every, axis=2), 0.004, rtol=0.5)
 
 
-def test_intervals_hold_errors_of_the_peaks_that_neighbouring_lines_share() -> None:
-    """Errors of 2 % of the motion, alike over some nine lines: no levels of noise explain them, and they are no modes."""
+def test_errors_that_neighbouring_lines_share_widen_the_covariance_of_plain_spectra_and_white_ones_do_not() -> None:
+    """Of frequencies, at the modes as they are; errors smoothed over nine lines have as much power in each mode's."""
     truth, test = spoiled("white", 4)
-    rng, errors = np.random.default_rng(1), []
-    motion, _ = truth.answers(test.freq)
-    for _ in range(8):
-        alike = rng.standard_normal((*motion.shape, 2)) @ [1, 1j]
-        alike = np.array([np.convolve(row, np.ones(9) / 3, mode="same") for row in alike])
-        spoiled_test = replace(test, response=(test.base * (motion + 0.02 * np.abs(motion - 1) * alike)), force=None)
-        n = len(truth.mass)
-        answer = sysid.identify(sysid.Problem(spoiled_test), strategy=sysid.Modal(modes=n), rng=0)
-        std = answer.uncertainty.natural_frequencies
-        errors.append((answer.structure.natural_frequencies - truth.poles[0]) / std)
-    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.6
+    lam, phi = scipy.linalg.eigh(truth.stiffness, truth.mass)
+    n, ones = lam.size, np.ones(lam.size)
+    modes = Modes(phi, (phi.T @ truth.mass @ ones)[:, None], np.sqrt(lam), truth.poles[1])
+    rigid = np.array([[ones @ truth.mass @ ones]])
+    assert scatter_of_lines(test, modes, rigid) is None
+    clean, noise = test.base * truth.answers(test.freq)[0], np.random.default_rng(1).standard_normal((n, 700, 2))
+    alike = np.array([np.convolve(row, np.ones(9) / 3, mode="same") for row in noise @ [1, 1j]])[:, : test.freq.size]
+    found = scatter_of_lines(replace(test, response=clean + 0.02 * alike, force=None), modes, rigid)
+    assert found is not None
+    at = slice(n * n + n, n * n + 2 * n)  # logarithms of frequencies, behind shapes and participations
+    inverse = np.linalg.pinv(found[0], rcond=1e-12, hermitian=True)
+    wide = np.sqrt(np.diag(inverse @ found[1] @ inverse)[at] / np.diag(inverse)[at])
+    assert np.all(wide > 1.5) and np.all(wide < 6.0)  # three times where a peak is wider than nine lines
