@@ -49,7 +49,7 @@ def draw(kind: str, seed: int) -> Draw:
     if answer.judgement == "determined":
         upper = np.triu_indices(n)
         pairs = (s.mass, truth.mass, sd.mass), (s.stiffness, truth.stiffness, sd.stiffness)
-        matrices = np.concatenate([((a - b) / std)[upper] for a, b, std in pairs])
+        matrices = np.concatenate([((a[:n, :n] - b) / std[:n, :n])[upper] for a, b, std in pairs])
     return Draw(True, modes, matrices, answer.judgement, accused)
 
 
