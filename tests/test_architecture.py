@@ -54,7 +54,7 @@ CEILINGS = {
     # and errors that grow with the signal, and the scatter of plain spectra (280),
     "lines": 46_930,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 76.8,
+    "branches": 76.9,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
