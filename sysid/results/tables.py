@@ -145,7 +145,8 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     if test.force is not None and levels.force is not None:
         names += [(f"force {axis}", "N m" if turn else "N") for axis, turn in zip(axes, turns, strict=True)]
         spectra, level = [*spectra, test.force], [*level, levels.force]
-    power = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=(0, 2))
+    power_of_runs = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=2)
+    power = power_of_runs.sum(axis=0)
     lines = density * test.own_lines.sum(axis=1)  # of each run
     found = np.concatenate([np.broadcast_to(part, (test.n_runs, part.shape[-1])) for part in level], axis=1)
     rms, std = np.sqrt(power / lines.sum()), np.sqrt(lines @ found**2 / lines.sum())
@@ -154,7 +155,8 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     if (shares := it.modal[0].shares) is not None:
         n, d = test.n_sensors, test.n_base
         order = [*range(n), *range(shares.shape[1] - d, shares.shape[1]), *range(n, shares.shape[1] - d)]
-        signal = (100 * np.sqrt(np.mean(shares[:, order] ** 2, axis=0))).tolist()
+        held = np.sum(shares[:, order] ** 2 * power_of_runs, axis=0)  # a direction does not move in all runs
+        signal = (100 * np.sqrt(held / np.where(power > 0, power, np.inf))).tolist()
     ends = zip(found.min(axis=0).tolist(), found.max(axis=0).tolist(), strict=True)
     return tuple(
         ChannelNoise(name, float(size), unit, float(share), both, of_signal)
