@@ -10,7 +10,7 @@ import scipy
 from scipy.optimize import approx_fprime
 
 import sysid
-from benchmarks.laboratory.stepped_tests import spoiled
+from benchmarks.laboratory.stepped_tests import frame, spoiled
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.growing_errors import scatter_of_lines
@@ -169,3 +169,32 @@ def test_errors_that_neighbouring_lines_share_widen_the_covariance_of_plain_spec
     inverse = np.linalg.pinv(found[0], rcond=1e-12, hermitian=True)
     wide = np.sqrt(np.diag(inverse @ found[1] @ inverse)[at] / np.diag(inverse)[at])
     assert np.all(wide > 1.5) and np.all(wide < 6.0)  # three times where a peak is wider than nine lines
+
+
+def test_frequency_responses_of_two_directions_read_to_half_a_per_cent_have_their_modes_and_are_determined() -> None:
+    """Two frames that a spring joins, one along each direction; each line of a direction has one error of the base."""
+    rng = np.random.default_rng(2)
+    along, across = frame(rng), frame(rng)
+    n, first = len(along.mass) + len(across.mass), len(along.mass)
+    M = scipy.linalg.block_diag(along.mass, across.mass)
+    K = scipy.linalg.block_diag(along.stiffness, across.stiffness)
+    K[0, first] = K[first, 0] = 0.05 * K[0, 0]
+    lam, phi = scipy.linalg.eigh(K, M)
+    C = M @ phi @ np.diag(0.024 * np.sqrt(lam)) @ phi.T @ M
+    G = np.repeat(np.eye(2), [first, n - first], axis=0)
+    f = np.sqrt(lam) / (2 * np.pi)
+    about = [one * (1 + 0.012 * np.linspace(-4, 4, 13)) for one in f]
+    freq = np.sort(np.concatenate([np.geomspace(0.4 * f[0], 1.1 * f[-1], 150), *about]))
+    w = 2 * np.pi * freq[:, None, None]
+    H = np.moveaxis(np.linalg.solve(K + 1j * w * C - w**2 * M, w**2 * (M @ G)), 0, -1) + G[:, :, None]
+    Z = np.einsum("nd,nm,mef->def", G, M, H)
+    reads = lambda *shape: 1 + 0.005 * rng.standard_normal((*shape, 2)) @ [1, 1j] / np.sqrt(2)  # noqa: E731
+    of_base = reads(1, 2, freq.size)
+    test = sysid.Measurement.from_frf(
+        freq, H * reads(*H.shape) * of_base, force=Z * reads(*Z.shape) * of_base, rigid_body=G, base_axes=("x", "y")
+    )
+    answer = sysid.identify(sysid.Problem(test), rng=0)
+    assert answer.judgement == "determined"
+    errors = (answer.structure.natural_frequencies - f) / answer.uncertainty.natural_frequencies
+    assert np.all(np.abs(errors) < 4)
+    assert all(one["percent_of_signal"] == pytest.approx(0.5, rel=0.2) for one in answer.to_dict()["noise"])
