@@ -234,6 +234,9 @@ BENCHMARKS = (
         "laboratory.reader_files", "files of laboratories and their broken twins: right, or one line", "10 s", "10 s"
     ),
     Benchmark(
+        "laboratory.growing_errors", "stepped sines read to a share: modes, intervals, judgement", "3 min", "20 s"
+    ),
+    Benchmark(
         "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "10 min", "15 s"
     ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),

@@ -40,6 +40,7 @@ from sysid.assessment.sensitivity import (
 from sysid.assessment.statements import conditioned
 from sysid.errors import check_frequencies, refuse
 from sysid.modal_analysis.coupled_spectra import coupling_information
+from sysid.modal_analysis.growing_errors import scatter_of_lines
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import (
     Coupling,
@@ -295,7 +296,7 @@ def moves_by_records(
     index = Index(structure.n_sensors, modes.omega.size, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
-    records, B, spectra = noise_records(test, structure, unknowns), None, None
+    records, B, spectra, scattered = noise_records(test, structure, unknowns), None, None, modal.scattered
     found = coupling_about(modal, modes) if modal.of_records else None
     if modal.of_records:
         A, B = information_about(modal, modes)
@@ -307,8 +308,10 @@ def moves_by_records(
             A, found = coupling_information(test, records, modes, rigid, coupling, structure.residual.static)
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
+        if structure.modal_damping and (uneven := scatter_of_lines(test, modes, structure.rigid_body_mass)):
+            (A, B), scattered = uneven, np.inf
     normals, unseen = spread(A, B, path)
-    inflation = inflation_of(test, records, unknowns, modal.scattered)
+    inflation = inflation_of(test, records, unknowns, scattered)
     shifts = np.zeros((index.size, 0))
     if gains or modal.calibration is not None:
         if spectra is not None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, as_float, refuse, whole_number
 from sysid.measurement.measurement import Measurement, without_delays
-from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records, without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import independent
@@ -256,7 +255,7 @@ def _test_again(modal: ModalEstimate, structure: Structure, unknowns: int, rng: 
     if modal.noise is None:
         again = _again(modal.records, structure, unknowns, rng)
     else:
-        again = _whole_again(modal, modal.noise, structure, rng)
+        again = _whole_again(modal, structure, rng)
     return _as_recorded(again, modal, rng)
 
 
@@ -275,21 +274,19 @@ def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.rando
     return other if test.force is None else replace(other, force=test.force + force[0])
 
 
-def _whole_again(
-    modal: ModalEstimate, noise: NoiseLevels, structure: Structure, rng: np.random.Generator
-) -> Measurement:
+def _whole_again(modal: ModalEstimate, structure: Structure, rng: np.random.Generator) -> Measurement:
     """Whole records that the structure makes with the same transients, and noise of the same levels in all channels."""
-    test, at_rest = modal.given, modal.records
+    test, at_rest, (n, d) = modal.given, modal.records, structure.rigid_body.shape
+    of_sensors, of_force, of_base = np.split(modal.own_deviations, [n, -d], axis=1)
 
-    def drawn(record: ComplexArray, levels: Array) -> ComplexArray:
-        std = np.sqrt(modal.density)[:, None, None] * levels[..., None]
+    def drawn(record: ComplexArray, std: Array) -> ComplexArray:
         return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)
 
-    response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, noise.response)
+    response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, of_sensors)
     force = None
-    if test.force is not None and at_rest.force is not None and noise.force is not None:
-        force = test.force - (at_rest.force - at_rest.predict_force(structure)) + drawn(test.force, noise.force)
-    return replace(test, base=test.base + drawn(test.base, noise.base), response=response, force=force)
+    if test.force is not None and at_rest.force is not None:
+        force = test.force - (at_rest.force - at_rest.predict_force(structure)) + drawn(test.force, of_force)
+    return replace(test, base=test.base + drawn(test.base, of_base), response=response, force=force)
 
 
 def _noise(std: Array, rng: np.random.Generator) -> ComplexArray:

@@ -87,7 +87,8 @@ class WholeRecords:
     where it is estimated with the fit. `varying`, (runs, channels), are sensors, forces and base directions whose level
     is found to vary over the lines; `taken`, (n_sensors [+ 1],), s, are delays that were taken off sensors and force:
     at one of its ends such a record holds what is not its own. `plain` tells that squares are fitted, the base's motion
-    as recorded. All three are set by the fit, in no file.
+    as recorded, and `grows` that the noise of each channel holds a share of its signal. All four are set by the fit, in
+    no file.
     """
 
     samples: tuple[int, ...]
@@ -97,6 +98,12 @@ class WholeRecords:
     varying: NDArray[np.bool_] | None = field(default=None)
     taken: Array | None = field(default=None)
     plain: bool = field(default=False)
+    grows: bool = field(default=False)
+
+    @property
+    def traces(self) -> int:
+        """Real numbers of each channel and run that sampling and detrending leave: of 1, i w and 1 / (i w)."""
+        return 3
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -173,6 +180,32 @@ class WholeRecords:
         noise = tree["noise"] and NoiseLevels(**tree["noise"])
         samples, rest = tuple(map(int, tree["samples"])), tuple(map(bool, tree["at_rest"]))
         return cls(samples, float(tree["sample_rate"]), rest, noise)
+
+
+class SteadyLines(WholeRecords):
+    """Lines that stand for themselves, without transients, as stepped sines leave them, or an analyser.
+
+    `sample_rate` is their least distance, Hz; variances are those of the complex numbers themselves.
+    """
+
+    @classmethod
+    def of(cls, runs: int, freq: Array, *, grows: bool = True) -> SteadyLines:
+        """Those of so many runs at lines in Hz."""
+        return cls((1,) * runs, float(np.diff(freq).min()), (True,) * runs, grows=grows)
+
+    @property
+    def traces(self) -> int:
+        """None: see `WholeRecords`."""
+        return 0
+
+    @property
+    def density(self) -> Array:
+        """One each."""
+        return np.ones(len(self.samples))
+
+    def pulses(self, last: float) -> tuple[Array, NDArray[np.bool_]]:
+        """None: see `WholeRecords`."""
+        return np.zeros(0), np.zeros((1, 0), bool)
 
 
 def check_options(estimator: str, *, at_rest: Any, noise: Any, segment: Any) -> None:

@@ -126,7 +126,7 @@ def _white_errors(fit: RecordFit) -> ComplexArray:
     left = np.zeros((model.channels, test.n_runs, test.freq.size), complex)
     for chunk in model.chunks(fit.parameters):
         at = np.searchsorted(test.freq, chunk.run.w / (2 * np.pi) * (1 - EPSILON))
-        left[:, chunk.run.number, at] = chunk.deviations(fit.levels)[0][:, None] * chunk.error
+        left[:, chunk.run.number, at] = chunk.deviations(fit.levels)[0] * chunk.error
     return left
 
 

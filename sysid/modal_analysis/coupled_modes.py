@@ -77,7 +77,7 @@ def with_couplings(
     if p.coupling is not None or m - fit.static < 2:
         return fit
     # Beside what a wrong gain or modes above the lines make, which couplings would mimic.
-    model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True)
+    model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True).at_signal(p)
     beyond, equations = max(fit.reduced, 1.0), model.normal_equations(p, fit.levels)
     promised, count = score_of_couplings(model, equations)
     above = (np.arange(model.size) >= model.n_fit + model.n * model.d) & (np.arange(model.size) < model.delays)

@@ -12,14 +12,22 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.measurement.measurement import Measurement, without_delays
+from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.growing_errors import errors_grow, may_grow
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.model_order import least_worth, no_modes, with_further_modes, without_spurious_modes
+from sysid.modal_analysis.model_order import (
+    least_worth,
+    no_modes,
+    peaks_of,
+    with_further_modes,
+    without_spurious_modes,
+)
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     WHOLE,
@@ -220,6 +228,8 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
     """The fit with couplings, then further modes that are worth it, without spurious ones; `some` as in `refitted`."""
     fit = with_couplings(fit, lambda rough: _pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
     monitor.keep(fit)
+    if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
+        return fit  # levels and shares do not explain what is left, and further modes would take long
     monitor.doing = "further modes"
     fit = with_further_modes(fit, some=some, monitor=monitor)
     monitor.doing = "spurious modes"
@@ -280,9 +290,8 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
     c = model.channels
     for chunk in model.chunks(fit.parameters):
-        variances = fit.levels[chunk.run.piece]
-        power = variances[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, variances[c:])
-        parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
+        variances = chunk.run.variances(fit.levels)
+        parts[chunk.run.number].append(np.sqrt(variances[:c] + np.sum(np.abs(chunk.H) ** 2 * variances[c:], axis=1)))
     std = _at_lines(test, parts)
     for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
         run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
@@ -323,12 +332,37 @@ def fit_modes(
     test = calibrated(test, calibration)
     if test.whole is None:
         turned = test if values is None else without_delays(test, values)
-        return replace(ModalEstimate.of_lines(turned), delays=delays, calibration=calibration)
+        found = _of_lines(turned, calibration, monitor or FitMonitor())
+        return replace(found, delays=delays)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
         fit = whole_fit(test, values, monitor=monitor)
         if calibration is not None and not (fit.stopped or np.any(calibration.values)):
             fit, calibration = _calibrated(fit, calibration, monitor)
         return estimate(fit, calibration)
+
+
+def _of_lines(test: Measurement, calibration: Calibration | None, monitor: FitMonitor) -> ModalEstimate:
+    """The estimate of lines that stand for themselves; with modes where their errors grow with the signal.
+
+    Where shares of the signal do not explain what is left, a model misses something: then the lines stand as given.
+    """
+    plain = replace(ModalEstimate.of_lines(test), calibration=calibration)
+    if test.sample_rate is not None or not may_grow(test):  # records in time have noise of a level
+        return plain
+    try:
+        with one_thread(), monitor.at_work():
+            poles = find_poles(test, monitor=lambda *_: monitor.check())  # told where a strategy asks for them
+            plain = replace(plain, poles=poles)
+            if not errors_grow(test, poles):
+                return plain
+            fit = _whole_fit(replace(test, whole=SteadyLines.of(test.n_runs, test.freq)), monitor)
+            if uneven(fit, but=0.03):  # as where squares take the place of noise
+                return plain
+            if calibration is not None and not np.any(calibration.values):
+                fit, calibration = _calibrated(fit, calibration, monitor)
+            return estimate(fit, calibration)
+    except (InputError, np.linalg.LinAlgError, Stop, KeyboardInterrupt):  # what is over ends the search that follows
+        return plain
 
 
 def _calibrated(
@@ -416,8 +450,9 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         (index.gamma.start + order[:, None] * d + np.arange(d)).ravel(),
         index.log_omega.start + order, index.log_ratios.start + order, index.rigid,
     ])  # fmt: skip
+    grows = fit.model.whole.grows  # lines that stand for themselves hold no transients
     found = ModalEstimate(
-        fit.test, without_transients(fit),
+        replace(fit.test, whole=None) if grows else fit.test, without_transients(fit),
         *modes.at(order), p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,

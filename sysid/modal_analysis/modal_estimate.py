@@ -153,6 +153,8 @@ class ModalEstimate:
     laws : tuple of FittedLaw
         Of modes that follow their amplitude, where this was asked for. Where none of them is certain the modes are
         those without.
+    poles : Poles or None
+        Of lines that stand for themselves, where they were looked for already.
     """
 
     given: Measurement
@@ -181,6 +183,7 @@ class ModalEstimate:
     delays: Delays | None = None
     calibration: Calibration | None = None
     laws: tuple[FittedLaw, ...] = ()
+    poles: Poles | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
@@ -199,8 +202,8 @@ class ModalEstimate:
 
     @property
     def of_records(self) -> bool:
-        """True where these are the statistics of whole records."""
-        return self.by_modes and self.given.whole is not None
+        """True where these are the statistics of whole records, or of lines whose errors grow with the signal."""
+        return self.by_modes and self.record_fit is not None
 
     @property
     def stopped(self) -> bool:
@@ -210,8 +213,23 @@ class ModalEstimate:
     @property
     def found_noise(self) -> bool:
         """True where the levels of its noise were found with the fit, so that they hold what the modes miss."""
-        whole = self.given.whole
-        return self.noise is not None and whole is not None and whole.noise is None
+        fit = self.record_fit
+        return self.noise is not None and fit is not None and fit.model.whole.noise is None
+
+    @property
+    def shares(self) -> Array | None:
+        """Shares of the signal in the noise of sensors, forces and base, (runs, c + d); None where it holds none."""
+        return None if self.record_fit is None else self.record_fit.shares
+
+    @property
+    def own_deviations(self) -> Array:
+        """Standard deviations of each channel's own noise at the lines, (runs, c + d, n_freq or 1)."""
+        assert self.noise is not None
+        fit = self.record_fit
+        if fit is not None and fit.shares is not None:
+            return np.sqrt([run.variances(fit.levels) for run in fit.model.runs])
+        levels = np.concatenate([self.noise.outputs, self.noise.base], axis=-1)
+        return np.asarray((np.sqrt(self.density)[:, None] * levels)[..., None])
 
     @property
     def scattered(self) -> float | None:
@@ -266,7 +284,11 @@ def estimated_poles(estimate: ModalEstimate, monitor: Callable[[int, float], obj
     """Poles of the modes, or, where none were fitted, those that stand out of the lines: see `find_poles`."""
     if estimate.by_modes:
         return Poles(estimate.omega, estimate.ratios, residual_of(estimate, estimate.modes))
-    return find_poles(estimate.records, monitor=monitor)
+    if estimate.poles is None:
+        return find_poles(estimate.records, monitor=monitor)
+    if monitor is not None:
+        monitor(1, estimate.poles.residual)
+    return estimate.poles
 
 
 def index_of(estimate: ModalEstimate) -> Index:

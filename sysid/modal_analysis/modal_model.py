@@ -41,12 +41,27 @@ class Run(NamedTuple):
     """(L,): of how many lines each stands for."""
     piece: int
     """Row of the levels of noise: runs are cut where levels vary over the lines."""
+    signal: Array | None = None
+    """(c + d, L): squares of what outputs and base hold at each line, where noise is a share of it; held in a fit."""
 
     def at(self, lines: Any) -> Run:
         """Some of its lines."""
         return self._replace(
-            w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines]
-        )
+            w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines],
+            signal=None if self.signal is None else self.signal[:, lines],
+        )  # fmt: skip
+
+    def variances(self, levels: Array) -> Array:
+        """Variances of the noise of outputs and base at its lines, (c + d, L), or (c + d, 1) where all are alike.
+
+        `levels` (pieces, c + d) are variances of a sample, (pieces, 2 (c + d)) where squared shares of the signal stand
+        behind them.
+        """
+        of_piece = levels[self.piece][:, None]
+        if self.signal is None:
+            return np.asarray(of_piece * self.density)
+        plain, shares = np.split(of_piece, 2)
+        return np.asarray(plain * self.density + shares * self.signal)
 
 
 class Weighed(NamedTuple):
@@ -310,8 +325,8 @@ class Lines:
     @cached_property
     def flexibility(self) -> ComplexArray:
         """See `coupled_flexibility`, (m, m, L)."""
-        modes, coupling = self.p.modes, self.p.coupling
-        assert coupling is not None
+        modes, m = self.p.modes, self.p.modes.omega.size
+        coupling = np.zeros((m, m)) if self.p.coupling is None else self.p.coupling
         return coupled_flexibility(self.run.w / (2 * np.pi), modes.omega, modes.ratios, coupling)
 
     def answer(self, loads: ComplexArray) -> ComplexArray:
@@ -331,18 +346,18 @@ class Lines:
         return real_times(self.shapes, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:
-        """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
-        variances, c = levels[self.run.piece] * self.run.density, self.model.channels
+        """Inverse deviations of the outputs' own noise, (c, L or 1), and deviations of the base's, (d, L or 1)."""
+        variances, c = self.run.variances(levels), self.model.channels
         return 1 / np.sqrt(variances[:c]), np.sqrt(variances[c:])
 
     def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
         """Errors, or other spectra (c, L), weighed by their full covariance."""
         scale, root = self.deviations(levels)
         if not np.any(root):
-            e = scale[:, None] * (self.error if error is None else error)
-            return Weighed(scale[:, None] * e, _power(e), self.run.base)
+            e = scale * (self.error if error is None else error)
+            return Weighed(scale * e, _power(e), self.run.base)
         V, factor = base_noise(self.H, scale, root)
-        e = scale[:, None] * (self.error if error is None else error)
+        e = scale * (self.error if error is None else error)
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
         noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
         for part, v in zip(V, noise, strict=True):
@@ -352,12 +367,12 @@ class Lines:
                 noise[j] -= factor[i, j].conj() * noise[i]
             noise[j] /= factor[j, j].real
         power = _power(e) + _power(noise)
-        return Weighed(scale[:, None] * e, power, self.run.base + root[:, None] * noise)
+        return Weighed(scale * e, power, self.run.base + root * noise)
 
     def covered(self, levels: Array) -> ComplexArray:
         """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
         scale, root = self.deviations(levels)
-        return scale[:, None] * base_noise(self.H, scale, root)[0]
+        return scale * base_noise(self.H, scale, root)[0]
 
     def inputs(self, base: ComplexArray) -> ComplexArray:
         """Likeliest motion of the base and loads by the motion at the ends of all runs, (d + 2 r, L)."""
@@ -385,11 +400,11 @@ class Lines:
 def base_noise(H: ComplexArray, scale: Array, root: Array) -> tuple[ComplexArray, ComplexArray]:
     """Noise of the base in units of the outputs' own, and its factor.
 
-    With ``B = D H sqrt(v_u)``, D the inverse deviations `scale` of the outputs (c,) and `root` the deviations of the
-    base (d,), and ``L L' = I + B' B``: ``B L'^-1`` (d, c, L) and L (d, d, L), a line of vectors at a time as d is at
-    most a few. Then ``S^-1 = D (I - V V') D``.
+    With ``B = D H sqrt(v_u)``, D the inverse deviations `scale` of the outputs (c, L or 1) and `root` the deviations of
+    the base (d, L or 1), and ``L L' = I + B' B``: ``B L'^-1`` (d, c, L) and L (d, d, L), all lines at once, as d is
+    at most a few. Then ``S^-1 = D (I - V V') D``.
     """
-    B = np.asarray(scale[:, None] * H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
+    B = np.asarray(scale * H.transpose(1, 0, 2) * root[:, None], dtype=complex)
     d = len(B)
     factor = np.zeros((d, d, B.shape[2]), dtype=complex)
     for j in range(d):

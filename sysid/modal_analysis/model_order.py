@@ -313,7 +313,8 @@ def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, lev
         thin = step * power[:, ::step]
         of_base = (thin @ covered[near][::step]).reshape(-1, len(square), len(square))
         total = thin.sum(axis=1)
-        trials.weights[block] += np.diag(square) * total[:, None, None] - of_base
+        every = np.broadcast_to(square, (len(square), w.size))[:, near][:, ::step]
+        trials.weights[block] += np.eye(len(square)) * (thin @ every.T)[:, None] - of_base
         strength[block] += total
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from sysid.modal_analysis.modal_model import base_noise, dots
+from sysid.modal_analysis.modal_model import Run, base_noise, dots
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.varying_levels import designs
 from sysid.structure.structure import Array, ComplexArray
@@ -21,6 +21,7 @@ from sysid.structure.thresholds import NEGLIGIBLE
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
 NO_NOISE = 2 * VANISHING  # levels at the least, which the fit's own numbers raise a little, are no noise
+_MOST_SHARE = 0.05  # of the signal in the noise: larger ones would explain modes, as of a frame that softens
 _LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
 
 
@@ -59,20 +60,44 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array) -> Array:
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // 8000)))  # more lines tell a level no better than the fit needs
     parts = _parts(thin, p)
-    least = floors(model)
-    share = np.median(levels / least, axis=1, keepdims=True)
+    least, most = floors(model), np.full_like(levels, np.inf)
+    share = np.median(levels[:, : least.shape[1]] / least, axis=1, keepdims=True)
     least = least * np.maximum(1.0, _LEAST_SHARE**2 * share)
+    if model.whole.grows:
+        most[:, least.shape[1] :] = _MOST_SHARE**2
+        least = np.hstack([least, np.full_like(least, VANISHING**2)])
     found = np.zeros_like(levels)
     for number in range(len(model.whole.samples)):
         D = _designs(model, number, levels.shape[1])
         rows = list(D)
-        found[rows] = _of_run([part for part in parts if part.piece in D], D, levels[rows], least[rows])
+        bounds = least[rows], most[rows] / _of_noise(model)
+        found[rows] = _of_run([part for part in parts if part.run.piece in D], D, levels[rows], bounds)
     return found * _of_noise(model)
 
 
 def _of_noise(model: RecordModel) -> float:
     """Factor of variances, of which the unknowns of a fit took a part."""
     return model.numbers / max(model.numbers - model.unknowns, model.numbers / 4)
+
+
+def rough_levels(model: RecordModel, p: Parameters) -> Array:
+    """Variances to begin with: what the first model leaves of the outputs, and the same share of the base."""
+    power = np.zeros((3, len(model.runs), model.channels + model.d))  # of errors and records; numbers of lines
+    for chunk in model.chunks(p):
+        run = chunk.run
+        for at, part in enumerate((np.vstack([chunk.error, run.base]), np.vstack([run.outputs, run.base]))):
+            power[at, run.number] += np.sum(np.abs(part) ** 2, axis=1) / run.density
+        power[2, run.number] += run.w.size
+    left, whole, lines = power
+    share = np.median(left[:, : model.channels] / np.where(whole > 0, whole, np.inf)[:, : model.channels])
+    left[:, model.channels :] *= share
+    least = floors(model)
+    levels = np.maximum(left / lines, least)
+    if not model.whole.grows:
+        return levels
+    # Where the base moves alike at all lines its two parts are one: the share.
+    levels[:, model.channels :] = least[:, model.channels :]
+    return np.hstack([levels, np.full_like(levels, 1e-6)])
 
 
 def plain_levels(model: RecordModel, p: Parameters) -> Array:
@@ -100,15 +125,19 @@ def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
         D = _designs(model, number, levels.shape[1])
         rows, every = list(D), np.concatenate(list(D.values()))
         x = np.linalg.lstsq(every, np.log(levels[rows]).ravel(), rcond=None)[0]
-        fisher = _likelihood([part for part in parts if part.piece in D], D, x)[2]
+        fisher = _likelihood([part for part in parts if part.run.piece in D], D, x)[2]
         inverse = np.linalg.inv(fisher + NEGLIGIBLE * np.eye(x.size))
         mean = np.mean(list(D.values()), axis=0)
+        if model.whole.grows:  # of both parts together
+            signal = np.concatenate([part.run.signal for part in parts if part.run.piece in D], axis=1).mean(axis=1)
+            both = np.stack(np.split(levels[number], 2)) * [np.ones(signal.size), signal]
+            mean = np.hstack([np.diag(part) for part in both / both.sum(axis=0)]) @ mean
         out.append(np.sqrt(np.einsum("ci,ij,cj->c", mean, inverse, mean)) / 2)
     return np.array(out)
 
 
 def _parts(model: RecordModel, p: Parameters) -> list[ErrorSpectra]:
-    return [ErrorSpectra(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in model.chunks(p)]
+    return [ErrorSpectra(chunk.error, chunk.H, chunk.run) for chunk in model.chunks(p)]
 
 
 def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]:
@@ -122,28 +151,32 @@ def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]
 
 
 class ErrorSpectra(NamedTuple):
-    """Some lines: errors (c, L), what passes the base on (c, d, L), density and piece of `Run`."""
+    """Some lines: errors (c, L), what passes the base on (c, d, L), and the records there."""
 
     error: ComplexArray
     H: ComplexArray
-    density: float
-    piece: int
+    run: Run
 
 
-def _of_run(parts: list[ErrorSpectra], D: dict[int, Array], levels: Array, least: Array) -> Array:
+def _of_run(parts: list[ErrorSpectra], D: dict[int, Array], levels: Array, bounds: tuple[Array, Array]) -> Array:
     """Variances of the pieces of one run, (pieces, c + d), with logarithms ``D x`` of a few numbers x."""
+    least, most = bounds
     every = np.concatenate(list(D.values()))
     x = np.linalg.lstsq(every, np.log(np.maximum(levels, least)).ravel(), rcond=None)[0]
     # A number stands for a channel's lowest level at most.
     lowest = np.min(np.where(every > 0, np.log(least).ravel()[:, None], np.inf), axis=0)
-    x = np.maximum(x, lowest)
+    highest = np.max(np.where(every > 0, np.log(most).ravel()[:, None], -np.inf), axis=0)
+    x = np.clip(x, lowest, highest)
     value, score, fisher = _likelihood(parts, D, x)
+    grows = parts[0].run.signal is not None
     for _ in range(30):
-        size = np.sqrt(np.diag(fisher))
-        step = np.linalg.solve(fisher / np.outer(size, size) + 1e-6 * np.eye(size.size), score / size) / size
-        step = np.clip(step, -2.0, 2.0)
+        free = np.where(score > 0, x < highest, x > lowest)  # others would turn the step of those that they go with
+        size, step = np.sqrt(np.maximum(np.diag(fisher)[free], np.finfo(float).tiny)), np.zeros(x.size)
+        # Of two parts of one channel's noise the smaller may hardly show.
+        scaled = fisher[np.ix_(free, free)] / np.outer(size, size) + np.diag(1e-6 + 0.1 * grows / size**2)
+        step[free] = np.clip(np.linalg.solve(scaled, score[free] / size) / size, -2.0, 2.0)
         while True:
-            trial = np.maximum(x + step, lowest)
+            trial = np.clip(x + step, lowest, highest)
             new = _likelihood(parts, D, trial)
             if new[0] >= value or np.abs(step).max() < _SETTLED:
                 break
@@ -162,11 +195,12 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
     In units of the noise ``S^-1 = I - V V'``, V as many columns as base directions: no matrix of all channels a line.
     """
     value, score, fisher = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
-    for error, H, density, piece in parts:
-        c, v = error.shape[0], density * np.exp(D[piece] @ x)
+    for error, H, run in parts:
+        c, design, levels = error.shape[0], D[run.piece], np.exp(D[run.piece] @ x)
+        v = run._replace(piece=0).variances(levels[None])
         scale = 1 / np.sqrt(v[:c])
         V, factor = base_noise(H, scale, np.sqrt(v[c:]))
-        e = scale[:, None] * error
+        e = scale * error
         inner = np.sum(V.conj() * e, axis=1)
         Ge = e - np.sum(V * inner[:, None], axis=0)
         inverse = np.moveaxis(np.linalg.inv(np.moveaxis(factor, -1, 0)), 0, -1)  # of L, (d, d, L)
@@ -175,15 +209,25 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
         TGT = np.eye(len(V))[:, :, None] - np.einsum("kil,kjl->ijl", inverse.conj(), inverse)
         size = error.shape[1]
         diagonal = np.diagonal(factor).real
-        value -= float(2 * np.sum(np.log(diagonal)) + size * np.sum(np.log(v[:c])))
+        value -= float(2 * np.sum(np.log(diagonal)) + size / v.shape[1] * np.sum(np.log(v[:c])))
         value -= float(np.vdot(e, e).real - np.vdot(inner, inner).real)
-        hidden = np.sum(_squares(V), axis=(0, 2))
-        excess = [np.sum(_squares(Ge), axis=1) - size + hidden, np.sum(_squares(TGe) - np.diagonal(TGT).T.real, axis=1)]
-        score += D[piece].T @ np.concatenate(excess)
-        between = np.sum(_squares(GT), axis=2).T
-        pairs = np.block([[np.diag(size - 2 * hidden) + _outer_squares(V), between],
+        hidden = np.sum(_squares(V), axis=0)
+        excess = np.vstack([_squares(Ge) - 1 + hidden, _squares(TGe) - np.diagonal(TGT).T.real])
+        if run.signal is not None:
+            # What each level makes of the variance at each line, by its logarithm, over that variance.
+            by = levels[:, None] * np.vstack([np.full_like(v, run.density), run.signal]) / np.tile(v, (2, 1))
+            inverse = np.einsum("jcl,jel->cel", V, V.conj())
+            inverse[np.arange(c), np.arange(c)] -= 1
+            G = np.concatenate([np.concatenate([inverse, GT.swapaxes(0, 1)], axis=1),
+                                np.concatenate([GT.conj(), TGT], axis=1)])  # fmt: skip
+            score += design.T @ np.sum(by * np.tile(excess, (2, 1)), axis=1)
+            fisher += design.T @ np.einsum("il,jl,ijl->ij", by, by, np.tile(_squares(G), (2, 2, 1))) @ design
+            continue
+        score += design.T @ np.sum(excess, axis=1)
+        between, covered = np.sum(_squares(GT), axis=2).T, np.sum(hidden, axis=1)
+        pairs = np.block([[np.diag(size - 2 * covered) + _outer_squares(V), between],
                           [between.T, np.sum(_squares(TGT), axis=2)]])  # fmt: skip
-        fisher += D[piece].T @ pairs @ D[piece]
+        fisher += design.T @ pairs @ design
     return value, score, fisher
 
 

@@ -17,14 +17,19 @@ from numpy.typing import NDArray
 
 from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import NoiseLevels
+from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.modal_model import ModeLaw
-from sysid.modal_analysis.noise_levels import bounded_by_lines, floors, likeliest_levels, plain_levels
+from sysid.modal_analysis.noise_levels import (
+    bounded_by_lines,
+    floors,
+    likeliest_levels,
+    plain_levels,
+    rough_levels,
+)
 from sysid.modal_analysis.record_model import (
-    TRACES,
     NormalEquations,
     Parameters,
     RecordModel,
@@ -60,8 +65,9 @@ class RecordFit:
     test : Measurement
         As given, on the clock of the base.
     parameters : Parameters
-    levels : (pieces, c + d)
-        Variances of a sample in time, of responses, forces and base; a row a run, or a stretch of a run's lines.
+    levels : (pieces, c + d) or (pieces, 2 (c + d))
+        Variances of a sample in time, of responses, forces and base; a row a run, or a stretch of a run's lines. Where
+        noise grows with the signal, squared shares of it behind them.
     chi2 : float
         ``sum e' S^-1 e``: half a chi-squared of `freedom` degrees where the model is right.
     settled : bool
@@ -91,7 +97,8 @@ class RecordFit:
     def model_of(self, p: Parameters, test: Measurement | None = None, *, gains: bool = False) -> RecordModel:
         """The model of other parameters, or of another test: of these where none is given."""
         coupled, m = p.coupling is not None, p.modes.omega.size
-        return RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled, laws=p.laws)
+        model = RecordModel(test or self.test, m, gains=gains, static=self.static, coupled=coupled, laws=p.laws)
+        return model.at_signal(p)
 
     @cached_property
     def asked(self) -> RecordModel:
@@ -132,10 +139,10 @@ class RecordFit:
         spread = 0.0
         for chunk in model.chunks(self.parameters):
             T = chunk.H
-            variances = self.levels[chunk.run.piece]
-            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / variances[:c]) * variances[c:]
+            variances = np.broadcast_to(chunk.run.variances(self.levels), (c + model.d, T.shape[-1]))
+            inner = np.einsum("cil,cjl,cl->lij", T.conj(), T, 1 / variances[:c]) * variances[c:].T[:, None]
             spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
-            spread += T.shape[-1] * float(np.sum(np.log(variances[:c] * chunk.run.density)))
+            spread += float(np.sum(np.log(variances[:c])))
         return -spread - self.chi2
 
     def information(self) -> Array:
@@ -151,17 +158,23 @@ class RecordFit:
     @property
     def levels_of_runs(self) -> Array:
         """Mean variances over the lines of each run, (runs, c + d)."""
-        mean, lines = np.zeros((self.test.n_runs, self.levels.shape[1])), np.zeros((self.test.n_runs, 1))
-        for run in self.model.runs:
-            mean[run.number] += run.w.size * self.levels[run.piece]
+        model = self.model
+        mean, lines = np.zeros((self.test.n_runs, model.channels + model.d)), np.zeros((self.test.n_runs, 1))
+        for run in model.runs:
+            mean[run.number] += run.w.size * run.variances(self.levels).mean(axis=1) / run.density
             lines[run.number] += run.w.size
         return mean / lines
+
+    @property
+    def shares(self) -> Array | None:
+        """Shares of the signal in the noise of responses, forces and base, (runs, c + d); None without any."""
+        return np.sqrt(np.split(self.levels, 2, axis=1)[1]) if self.model.whole.grows else None
 
     @property
     def noise(self) -> NoiseLevels:
         """The levels, stated or found, as standard deviations; found ones hold no more than the quietest lines."""
         found = self.levels_of_runs
-        if self.model.whole.noise is None:
+        if self.model.whole.noise is None and not self.model.whole.grows:
             found = bounded_by_lines(self.model, found)
         root, n, d = np.sqrt(found), self.test.n_sensors, self.test.n_base
         if len(root) == 1:
@@ -176,7 +189,7 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": self.model.whole.plain,
+            "gains": p.gains, "plain": self.model.whole.plain, "grows": self.model.whole.grows,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
 
@@ -189,6 +202,8 @@ class RecordFit:
         InputError
             Where it is of another test.
         """
+        if tree.get("grows", False) and test.whole is None:
+            test = replace(test, whole=SteadyLines.of(test.n_runs, test.freq))
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
@@ -203,7 +218,7 @@ class RecordFit:
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains]
         shapes: list[tuple[int, ...]] = [
             (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
-            (test.n_runs, c, trace_count(test)), (len(model.runs), c + model.d),
+            (test.n_runs, c, trace_count(test)), (len(model.runs), (c + model.d) * (1 + model.whole.grows)),
             (model.by_gains.shape[2],),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
@@ -264,7 +279,7 @@ def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None =
     test = replace(test, whole=replace(test.whole, varying=was.varying, plain=was.plain))
     p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
     traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
-    traces[..., :TRACES] = p.traces[..., :TRACES]
+    traces[..., : was.traces] = p.traces[..., : was.traces]
     return refitted(replace(fit, test=test), replace(p, traces=traces, gains=np.zeros(0)), monitor=monitor)
 
 
@@ -287,6 +302,7 @@ def fit_model(
     test = model.test
     assert test.whole is not None
     stated, least, plain = test.whole.noise, floors(model), test.whole.plain
+    model = model.at_signal(p)
     if plain:
         levels = plain_levels(model, p)
     elif stated is not None:
@@ -295,17 +311,21 @@ def fit_model(
         levels = rough_levels(model, p)
     settled, chi2, equations = False, np.inf, _Equations(model, coarse)
     for round_ in range(limits.rounds):
+        if model.whole.grows:  # held within a round: varying without log det it would bias the modes
+            model = model.at_signal(p)
+            equations = _Equations(model, coarse and coarse.at_signal(p))
         p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), equations)
         if stated is not None:
             settled = done
             break
         before = levels
         levels = plain_levels(model, p) if plain else likeliest_levels(model, p, levels)
-        if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
+        changes = [np.log(run.variances(levels) / run.variances(before)) for run in model.runs]
+        if done and max(np.abs(one).max() for one in changes) < 2 * _SAME_LEVELS:
             settled = True
             break
     if stated is None:
-        chi2 = model.chi2(p, levels)  # at the last levels
+        chi2 = model.at_signal(p).chi2(p, levels)  # at the last levels
     return RecordFit(test, p, levels, chi2, settled, static=model.static)
 
 
@@ -432,20 +452,6 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
         ends = ends * scale[:, None]
     channels = test.n_sensors + (0 if test.force is None else d)
     return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, trace_count(test))))
-
-
-def rough_levels(model: RecordModel, p: Parameters) -> Array:
-    """Variances to begin with: what the first model leaves of the outputs, and the same share of the base."""
-    power = np.zeros((3, len(model.runs), model.channels + model.d))  # of errors and records; numbers of lines
-    for chunk in model.chunks(p):
-        run = chunk.run
-        for at, part in enumerate((np.vstack([chunk.error, run.base]), np.vstack([run.outputs, run.base]))):
-            power[at, run.number] += np.sum(np.abs(part) ** 2, axis=1) / run.density
-        power[2, run.number] += run.w.size
-    left, whole, lines = power
-    share = np.median(left[:, : model.channels] / np.where(whole > 0, whole, np.inf)[:, : model.channels])
-    left[:, model.channels :] *= share
-    return np.maximum(left / lines, floors(model))
 
 
 def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:

@@ -36,8 +36,6 @@ from sysid.modal_analysis.response import real_times
 from sysid.modal_analysis.varying_levels import segments
 from sysid.structure.structure import Array, ComplexArray
 
-TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w); further ones where delays were taken off
-
 
 class RecordModel(SpectralModel):
     """The model of a test of whole records with m modes.
@@ -87,7 +85,7 @@ class RecordModel(SpectralModel):
         if self.pulses.size:  # a run that begins and ends at rest has none
             of_channels = np.append(reached, np.repeat(reached[self.n :], self.d - 1, axis=0), axis=0)
             own = of_channels & np.isin(np.arange(test.n_runs), self.whole.moving)[:, None, None]
-            traces = np.concatenate([np.ones((*own.shape[:2], TRACES), bool), own], axis=2)
+            traces = np.concatenate([np.ones((*own.shape[:2], self.whole.traces), bool), own], axis=2)
             self.held[self.kept + self.n_ends : self.coupling.start] = ~traces.ravel()
 
     def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
@@ -118,8 +116,19 @@ class RecordModel(SpectralModel):
     def trace_spectra(self, freq: Array) -> ComplexArray:
         """Spectra of which the traces of a channel are multiples, (traces, L): last those of turned records' ends."""
         unit = freq / self.test.freq[-1]
-        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
+        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])[: self.whole.traces]
         return np.concatenate([plain, np.exp(2j * np.pi * self.pulses[:, None] * freq)])
+
+    def at_signal(self, p: Parameters) -> RecordModel:
+        """The same, shares of the signal in the noise being those of what these parameters predict."""
+        if not self.whole.grows:
+            return self
+        other, each = copy(self), [Lines(self, p, run) for run in self.runs]
+        other.runs = [
+            run._replace(signal=np.abs(np.vstack([run.outputs - lines.error, run.base])) ** 2)
+            for run, lines in zip(self.runs, each, strict=True)
+        ]
+        return other
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
@@ -212,7 +221,7 @@ class RecordModel(SpectralModel):
         """Some lines at given parameters."""
         if p.laws:
             return LawChunk(self, p, run)
-        return Chunk(self, p, run) if p.coupling is None else CoupledChunk(self, p, run)
+        return Chunk(self, p, run) if p.coupling is None and run.signal is None else SummedChunk(self, p, run)
 
     def normal_equations(self, p: Parameters, levels: Array) -> NormalEquations:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
@@ -235,7 +244,7 @@ class RecordModel(SpectralModel):
                 found[piece] = columns, scale, before.plus(each(chunk, levels, columns))
             else:
                 columns = chunk.columns()
-                found[piece] = columns, chunk.deviations(levels)[0], each(chunk, levels, columns)
+                found[piece] = columns, chunk.deviations(levels)[0][:, 0], each(chunk, levels, columns)
         for columns, scale, sums in found.values():
             products, at = columns.products(sums, scale), columns.unknowns
             if products.normal.size:
@@ -370,7 +379,7 @@ class Chunk(Lines):
 
     def products(self, levels: Array, columns: Columns) -> NormalEquations:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
-        return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
+        return columns.products(self.sums(levels, columns), self.deviations(levels)[0][:, 0])
 
 
 class LawChunk(Chunk):
@@ -410,8 +419,8 @@ class LawChunk(Chunk):
         yield from law_entries(self.p, model.index.phi.start, model.of_laws.start, at, self.shapes[channel])
 
 
-class CoupledChunk(Chunk):
-    """The same of modes that dampers couple: each load moves all of them.
+class SummedChunk(Chunk):
+    """The same of modes that dampers couple, each load moving all of them, and of noise that grows with the signal.
 
     With A the flexibility, a change D of what it is the inverse of moves the motions q by ``-A D q``. So a column of a
     load, a pole or a coupling is a spectrum times the responses of all channels to a load of one mode, (c, L), those of
@@ -498,7 +507,7 @@ class CoupledChunk(Chunk):
 def trace_count(test: Measurement) -> int:
     """Real numbers of each channel and run beside the response and its transients."""
     assert test.whole is not None
-    return TRACES + test.whole.pulses(test.freq[-1])[0].size
+    return test.whole.traces + test.whole.pulses(test.freq[-1])[0].size
 
 
 def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:

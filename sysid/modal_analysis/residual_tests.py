@@ -65,7 +65,7 @@ def noise_powers(fit: RecordFit) -> list[Array]:
     parts: list[list[Array]] = [[] for _ in range(fit.test.n_runs)]
     for chunk in fit.model.chunks(fit.parameters):
         seen, V = chunk.weighed(fit.levels).whitened_residual, chunk.covered(fit.levels)
-        squares = chunk.deviations(fit.levels)[0][:, None] ** 2
+        squares = chunk.deviations(fit.levels)[0] ** 2
         of_outputs = squares - np.sum(np.abs(V) ** 2, axis=0)
         H = chunk.H.swapaxes(0, 1)
         base = np.sum(H.conj() * seen, axis=1)
@@ -124,7 +124,7 @@ def with_varying_levels(fit: RecordFit, *, monitor: FitMonitor | None = None) ->
     the levels are tried beside the modes as they are, and only then fitted with them.
     """
     assert fit.test.whole is not None
-    if fit.test.whole.noise is not None:
+    if fit.test.whole.noise is not None or fit.test.whole.grows:
         return fit
     found, trial = excess_of(fit), fit
     varying = np.zeros((fit.test.n_runs, fit.levels.shape[1]), bool)
@@ -251,9 +251,9 @@ def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
     Where the fit with these transients still leaves more than noise about the peaks, the model is wrong and no run is
     accused. Where the fit was stopped none is looked for.
     """
-    if fit.stopped:
-        return ()
     assert fit.test.whole is not None
+    if fit.stopped or fit.test.whole.grows:
+        return ()
     stated = [run for run, rest in enumerate(fit.test.whole.at_rest) if rest]
     found = []
     for run in stated:
@@ -382,7 +382,7 @@ def _moves_by_gains(fit: RecordFit, half: Array, of_constants: Array) -> Array:
         of_base = [-chunk.H[:, j] * base[j] for j in range(d)]
         of_force = [np.where(np.arange(len(channels))[:, None] == i, channels, 0.0) for i in range(n, len(channels))]
         for pull, error in zip(pulls, of_base + of_force, strict=False):  # without a force its moves stay zero
-            products = at.products(chunk.sums_of_errors(fit.levels, at, error), chunk.deviations(fit.levels)[0])
+            products = at.products(chunk.sums_of_errors(fit.levels, at, error), chunk.deviations(fit.levels)[0][:, 0])
             pull[at.unknowns] += products.gradient
     moves = np.zeros((model.index.size, n + 2 * d))
     moves[: model.kept] = np.hstack([of_constants, half @ (half.T @ pulls.T)])[: model.kept]

@@ -144,7 +144,7 @@ def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Arra
     for chunk in fit.model.chunks(fit.parameters):
         slope = np.abs(chunk.g**2 * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)) ** 2
         inverse_std, _ = chunk.deviations(fit.levels)
-        passed = np.sum(np.abs(chunk.H) ** 2 * (inverse_std**2)[:, None, None], axis=(0, 1))
+        passed = np.sum(np.abs(chunk.H) ** 2 * (inverse_std**2)[:, None], axis=(0, 1))
         parts.append(np.vstack([chunk.run.w, chunk.weighed(fit.levels).power, passed, slope]))
     w, left, passed, *slopes = np.concatenate(parts, axis=1)
     weight = np.array(slopes) / np.maximum(np.sum(slopes, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -9,13 +9,19 @@ from sysid.results.identification import Identification
 
 
 def noise(it: Identification) -> str:
-    """The noise of each channel of whole records."""
-    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in tables.noise_of_channels(it)]
+    """The noise of each channel."""
+    found = tables.noise_of_channels(it)
+    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent), *one.signal_in_words) for one in found]
+    of = "a sample in time, of noise up to half the sample rate"
+    if grows := it.modal[0].shares is not None:
+        of = "a line, of all lines together"
     caption = (
-        f"Noise of each channel, {tables.noise_source(it)}: standard deviation of a sample in time, of noise up to "
-        "half the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
+        f"Noise of each channel, {tables.noise_source(it)}: standard deviation of {of} (from least to most, where runs "
+        "differ), and its share of what was recorded at the lines."
+        + " The last column: the part of the noise that grows with the signal, as a share of it at each line; at most "
+        "5 % is looked for." * grows
     )
-    return table(("channel", *tables.NOISE_COLUMNS), rows, caption)
+    return table(("channel", *tables.noise_columns(it)), rows, caption)
 
 
 def sensors(it: Identification) -> str:

@@ -218,7 +218,13 @@ class Identification(Answer):
                 for o in self.outliers
             ],
             "noise": [
-                {"channel": c.channel, "level": c.level, "unit": c.unit, "percent_of_rms": c.percent}
+                {
+                    "channel": c.channel,
+                    "level": c.level,
+                    "unit": c.unit,
+                    "percent_of_rms": c.percent,
+                    "percent_of_signal": c.signal,
+                }
                 for c in noise_of_channels(self)
             ],
             "gains": [

@@ -84,9 +84,12 @@ def summary(it: Answer) -> str:
 
 
 def _noise(it: Answer) -> list[str]:
-    """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in tables.noise_of_channels(it)]
-    return _table((f"noise {tables.noise_source(it)}", *tables.NOISE_COLUMNS), rows)
+    """Table of the noise of each channel, where it was found or stated with the modes."""
+    rows = [
+        (one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}", *one.signal_in_words)
+        for one in tables.noise_of_channels(it)
+    ]
+    return _table((f"noise {tables.noise_source(it)}", *tables.noise_columns(it)), rows)
 
 
 def _gains(it: Answer) -> list[str]:

@@ -99,6 +99,8 @@ class ChannelNoise(NamedTuple):
     """Noise of a channel: deviation of a sample, were it white up to half the sample rate, and its share of the record.
 
     Both of all runs together, `runs` the least and most of single ones; per cent of the rms of the record at the lines.
+    Where errors grow with the signal it is the deviation at a line, all lines together, and `signal` is the share of
+    the signal that each line's error holds, in per cent.
     """
 
     channel: str
@@ -106,6 +108,7 @@ class ChannelNoise(NamedTuple):
     unit: str
     percent: float
     runs: tuple[float, float]
+    signal: float | None = None
 
     @property
     def level_in_words(self) -> str:
@@ -113,12 +116,21 @@ class ChannelNoise(NamedTuple):
         least, most = self.runs
         return f"{self.level:.3g}" if most < LEVEL * least else f"{least:.3g} to {most:.3g}"
 
+    @property
+    def signal_in_words(self) -> tuple[str, ...]:
+        """The share of the signal, if there is any, as a cell of a row."""
+        return () if self.signal is None else (f"{self.signal:.2g}",)
 
-NOISE_COLUMNS = "of a sample", "unit", "at the lines, % of rms"
+
+def noise_columns(it: Answer) -> tuple[str, ...]:
+    """Heads of the table of the noise, behind that of the channels."""
+    if it.modal[0].shares is None:
+        return "of a sample", "unit", "at the lines, % of rms"
+    return "of a line", "unit", "at the lines, % of rms", "share of signal, %"
 
 
 def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
-    """Noise of sensors, base and force of whole records; none for other records.
+    """Noise of sensors, base and force, of whole records or where it grows with the signal; none for other records.
 
     Per cent are of what the channel records over the lines of the test, noise and all, so that a band makes both alike.
     """
@@ -133,15 +145,22 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     if test.force is not None and levels.force is not None:
         names += [(f"force {axis}", "N m" if turn else "N") for axis, turn in zip(axes, turns, strict=True)]
         spectra, level = [*spectra, test.force], [*level, levels.force]
-    power = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=(0, 2))
+    power_of_runs = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=2)
+    power = power_of_runs.sum(axis=0)
     lines = density * test.own_lines.sum(axis=1)  # of each run
     found = np.concatenate([np.broadcast_to(part, (test.n_runs, part.shape[-1])) for part in level], axis=1)
     rms, std = np.sqrt(power / lines.sum()), np.sqrt(lines @ found**2 / lines.sum())
     percent = 100 * std / np.where(rms > 0, rms, np.inf)
+    signal: list[float | None] = [None] * percent.size
+    if (shares := it.modal[0].shares) is not None:
+        n, d = test.n_sensors, test.n_base
+        order = [*range(n), *range(shares.shape[1] - d, shares.shape[1]), *range(n, shares.shape[1] - d)]
+        held = np.sum(shares[:, order] ** 2 * power_of_runs, axis=0)  # a direction does not move in all runs
+        signal = (100 * np.sqrt(held / np.where(power > 0, power, np.inf))).tolist()
     ends = zip(found.min(axis=0).tolist(), found.max(axis=0).tolist(), strict=True)
     return tuple(
-        ChannelNoise(name, float(size), unit, float(share), both)
-        for (name, unit), size, share, both in zip(names, std, percent, ends, strict=True)
+        ChannelNoise(name, float(size), unit, float(share), both, of_signal)
+        for (name, unit), size, share, both, of_signal in zip(names, std, percent, ends, signal, strict=True)
     )
 
 

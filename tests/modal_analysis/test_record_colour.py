@@ -8,6 +8,7 @@ from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.records.simulated import four_storeys
+from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.varying_levels import KNOTS, designs, segments
 
@@ -43,8 +44,10 @@ def test_the_score_of_varying_levels_is_the_slope_of_the_likelihood() -> None:
     middles = np.array([5.0, 20.0, 60.0])
     D = dict(enumerate(designs(middles, (4.0, 64.0), np.array([False, True, True]))))
     z = rng.standard_normal((2, 3, 2, 2, 30))
+    run = Run(np.ones(30), np.zeros((1, 30), complex), np.zeros((2, 30), complex), 0.7, 0, np.ones(30), 0)
     parts = [
-        ErrorSpectra(z[0, i, 0] + 1j * z[1, i, 0], (z[0, i, 1] + 1j * z[1, i, 1])[:, None], 0.7, i) for i in range(3)
+        ErrorSpectra(z[0, i, 0] + 1j * z[1, i, 0], (z[0, i, 1] + 1j * z[1, i, 1])[:, None], run._replace(piece=i))
+        for i in range(3)
     ]
     x = 0.3 * rng.standard_normal(1 + 2 * KNOTS)
     slope = approx_fprime(x, lambda x: _likelihood(parts, D, x)[0], 1e-6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import peaks_of, trials_of
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
@@ -117,7 +118,8 @@ def test_the_likelihood_of_levels_is_that_of_covariances_written_out():
     z = rng.standard_normal((2, c, 1 + d, lines))
     e, H = z[0, :, 0] + 1j * z[1, :, 0], z[0, :, 1:] + 1j * z[1, :, 1:]
     x = rng.uniform(-1, 1, c + d)
-    value, _, fisher = _likelihood([ErrorSpectra(e, H, density, 0)], {0: np.eye(c + d)}, x)
+    run = Run(np.ones(lines), np.zeros((d, lines), complex), np.zeros_like(e), density, 0, np.ones(lines), 0)
+    value, _, fisher = _likelihood([ErrorSpectra(e, H, run)], {0: np.eye(c + d)}, x)
     v, made, information = density * np.exp(x), 0.0, np.zeros((c + d, c + d))
     for at in range(lines):
         directions = np.hstack([np.eye(c), H[:, :, at]])

@@ -48,7 +48,7 @@ def test_shares_are_those_at_the_lines_and_runs_that_differ_are_told():
         runs.append((clean[:1], clean[1:] + level * rng.standard_normal((1, n)), None))
     test = sysid.Measurement.from_time(runs, rate, rigid_body=[[1.0]], band=(1.0, rate / 4))
     stated = sysid.NoiseLevels(np.array(levels)[:, None], np.array([0.02]))
-    modal = [SimpleNamespace(density=test.whole.density)]
+    modal = [SimpleNamespace(density=test.whole.density, shares=None)]
     it = SimpleNamespace(noise=stated, modal=modal, records=SimpleNamespace(measurement=test))
     sensor, base = noise_of_channels(it)
     half = lambda x: signal.sosfilt(signal.butter(8, [1.0, rate / 4], "bandpass", fs=rate, output="sos"), x)  # noqa: E731

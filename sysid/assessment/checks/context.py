@@ -100,7 +100,7 @@ def _quiet_base(modal: ModalEstimate) -> Array | None:
 
     Levels are found with modes of constant poles: what these leave at the peaks passes for noise of the base.
     """
-    if modal.noise is None or not modal.found_noise or modal.varying:
+    if modal.noise is None or not modal.found_noise or modal.varying or modal.shares is not None:
         return None
     quiet = quiet_levels(modal.given)
     return None if quiet is None else np.minimum(quiet.base / modal.noise.base, 1.0).max(axis=1)
