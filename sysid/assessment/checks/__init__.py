@@ -13,6 +13,7 @@ from sysid.assessment.checks import (
     gains,
     mistakes,
     model_error,
+    rocking,
     search_end,
     stated,
 )
@@ -25,6 +26,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
+    rocking.rocking_tables,
     brackets.soft_brackets,
     stated.stated_masses,
     search_end.missed_goal,

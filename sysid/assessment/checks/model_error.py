@@ -42,6 +42,8 @@ def beyond_noise(context: Context) -> Iterator[Finding]:
     """The model misses the records by more than their noise."""
     if context.problem.stated.goal is not None and (context.named or not context.is_judged):
         return
+    if context.has("table rocks"):
+        return
     for miss in context.misses:
         if miss.times > BEYOND:
             yield Finding(
@@ -54,7 +56,7 @@ def beyond_noise(context: Context) -> Iterator[Finding]:
 
 def least_squares(context: Context) -> Iterator[Finding]:
     """No modes with noise in all channels explain whole records, and squares of what is left were fitted instead."""
-    if context.named or not context.is_judged:
+    if context.named or not context.is_judged or context.has("table rocks"):
         return
     for i, modal, structure in context.fits:
         whole = modal.given.whole
