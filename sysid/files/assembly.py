@@ -17,7 +17,7 @@ from sysid.files.alignment import UnitColumns, clock_moves
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
-from sysid.measurement.spectra import TimeRun, on_one_clock
+from sysid.measurement.spectra import FORCE_NEEDED, TimeRun, on_one_clock
 from sysid.measurement.whole import tapered
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, rigid_motion, sensor_row
 from sysid.structure.structure import Array
@@ -313,8 +313,10 @@ def base_differences(
 def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """The sum of the load cells along the base's directions, (d, n)."""
     cells = _motions(parts, said, axes)
+    known = np.linalg.matrix_rank(cells)
     unseen = [axis for axis, column in zip(axes, cells.T, strict=True) if not np.any(column)]
-    refuse((unseen, f"{place}: no force sensor acts along {' '.join(unseen)}: measure it there too, or give no force"))
+    where = f"along {' '.join(unseen)}" if unseen else f"apart enough: they tell {known} of {' '.join(axes)}"
+    refuse((known < len(axes), f"{place}: no force sensor acts {where}: {FORCE_NEEDED}"))
     return cells.T @ np.array([values for _, values in parts])
 
 

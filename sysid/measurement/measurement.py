@@ -21,7 +21,7 @@ from sysid.errors import (
 )
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
-from sysid.measurement.spectra import Missing, checked_deviations, checked_lines, complete, named, present
+from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -124,7 +124,8 @@ class Measurement:
         if self.force is not None:
             put("force", checked_lines("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
-                raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
+                words = f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes"
+                raise InputError(f"{words}: {FORCE_NEEDED}" if self.force.shape[1] < self.base.shape[1] else words)
         put("sensors", checked_sensors(self.sensors))
         refuse(
             (runs != response_runs, f"base has {runs} runs but response has {response_runs}"),
@@ -350,7 +351,7 @@ class Measurement:
         d = H.shape[1]
         F = None if force is None else checked_lines("force", force, lines.size, read)
         if F is not None and F.shape != (d, d, lines.size):
-            raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}")
+            raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}: {FORCE_NEEDED}")
         given = (
             H,
             F,
