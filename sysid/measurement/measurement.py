@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,6 +37,17 @@ from sysid.structure.sensor import (
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
+
+
+class BaseSensor(NamedTuple):
+    """A sensor of the base among more than its directions need: how it reads the motion that is taken for the base's.
+
+    `gain` times that motion, and by the share `off` of its record beside it.
+    """
+
+    name: str
+    gain: float
+    off: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,6 +89,8 @@ class Measurement:
         (d,) and of the force's (d,); one number is that of all. By default those that `sensors` state, others exact.
     damage : tuple of DamagedChannel
         Damaged samples of the records of which `from_time` makes it.
+    base_sensors : tuple of BaseSensor
+        Of which the base's motion was made, where they are more than its directions.
 
     Notes
     -----
@@ -104,6 +117,7 @@ class Measurement:
     base_gain_std: Array | None = field(default=None, kw_only=True)
     force_gain_std: Array | None = field(default=None, kw_only=True)
     damage: tuple[DamagedChannel, ...] = field(default=(), kw_only=True)
+    base_sensors: tuple[BaseSensor, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -166,6 +180,7 @@ class Measurement:
             "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
             "force_gain_std": self.force_gain_std,
             "damage": [one.to_tree() for one in self.damage],
+            "base_sensors": [one._asdict() for one in self.base_sensors],
         }  # fmt: skip
 
     @classmethod
@@ -175,6 +190,7 @@ class Measurement:
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
         damage = tuple(map(DamagedChannel.from_tree, tree.get("damage", ())))
         given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
+        given["base_sensors"] = tuple(BaseSensor(**one) for one in tree.get("base_sensors", ()))
         return cls(**{**tree, **given})
 
     @property

@@ -7,6 +7,7 @@ import pytest
 
 import sysid
 from sysid import Problem, Sensor
+from sysid.measurement.measurement import BaseSensor
 
 HEIGHTS = np.array([0.6, 1.1, 1.9, 2.4])
 MASS = np.array([4.0, 3.0, 5.0, 2.0])
@@ -83,6 +84,13 @@ def test_wrong_gains_are_told_as_such(gains, channel):
     assert (told.kind in ("gain", "rigid motion"), told.channel) == (True, channel)
 
 
+def test_tolerances_of_gains_take_no_rotation_off():
+    test = dataclasses.replace(spectra(0.08), gain_std=0.005)
+    (told,) = [one for one in found(test) if one.severity == "contradicts"]
+    assert told.kind == "table rocks" and told.numbers["slope"] == pytest.approx(0.08, abs=4 * told.numbers["std"])
+    assert 0.5 * 0.005 / HEIGHTS.max() < told.numbers["std"] < 0.01
+
+
 def test_a_mode_below_the_lines_is_no_table_that_rocks():
     f = np.sqrt(np.linalg.eigvals(K / MASS[:, None]).real.min()) / (2 * np.pi)
     lines = np.geomspace(1.6 * f, 13.0, 300)
@@ -103,3 +111,15 @@ def test_a_rotation_that_is_stated_in_rigid_body_is_part_of_the_base_motion():
 def test_without_positions_nothing_is_told_of_a_table():
     plain = dataclasses.replace(spectra(), sensors=None)
     assert "table rocks" not in [one.kind for one in found(plain)]
+
+
+@pytest.mark.parametrize(("tolerance", "told"), [(0.0, 1), (0.02, 0)])
+def test_base_sensors_that_differ_are_told_beyond_their_tolerance(tolerance, told, tmp_path):
+    read = (BaseSensor("near", 0.98, 0.02), BaseSensor("far", 1.02, 0.02))
+    test = dataclasses.replace(spectra(0.0), base_sensors=read, base_gain_std=tolerance)
+    result = sysid.identify(Problem(test), rng=0)
+    result = sysid.load(result.save(tmp_path / "result.h5"))
+    assert result.measurement.base_sensors == read
+    notes = [one for one in result.findings if one.kind == "base sensors"]
+    assert [one.severity for one in notes] == ["note"] * told
+    assert [one.numbers["most"] for one in notes] == [pytest.approx(0.02)] * told

@@ -41,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.untried_modes,
     stated.on_a_bound,
     search_end.search_boxes,
+    gains.base_sensors,
     gains.modes_below,
     model_error.other_levels,
     search_end.lines_left_out,

@@ -94,12 +94,19 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     share it are counted as such; noise that is stated larger counts as stated. What was taken off the records within
     stated tolerances is a part of the errors.
     """
-    found, calibration = _of_left(modal, structure), modal.calibration
-    if calibration is None:
+    found = _of_left(modal, structure)
+    if modal.calibration is None:
         return found
-    H, taken = seen_at_sensors(modal.records), calibration.seen(modal.records)
-    tolerance = np.sqrt(H**2 @ calibration.tolerance**2)
+    taken, tolerance = tolerated_errors(modal)
     return replace(found, error=(1 + found.error) * (1 + taken) - 1, tolerance=tolerance)
+
+
+def tolerated_errors(modal: ModalEstimate) -> tuple[Array, Array]:
+    """Errors of sensors' gains against the base that were taken off, and their tolerances, (n_sensors,) each."""
+    calibration, seen = modal.calibration, seen_at_sensors(modal.records)
+    if calibration is None:
+        return np.zeros(len(seen)), np.zeros(len(seen))
+    return calibration.seen(modal.records), np.sqrt(seen**2 @ calibration.tolerance**2)
 
 
 def _of_left(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -155,6 +162,28 @@ def below_lines(test: Measurement, structure: Structure) -> Array:
     """Frequencies of modes and residual modes below the lines, Hz, where they answer like a constant."""
     f = np.append(structure.natural_frequencies, structure.residual.natural_frequencies)
     return np.sort(f[f < test.freq[test.freq > 0][0]])
+
+
+def base_sensors(context: Context) -> Iterator[Finding]:
+    """Sensors of one motion of the base differ, by more than their tolerance."""
+    problem = context.problem
+    yield from of_tests([list(_differ(one)) for one in problem.modal[problem.first_test - 1 :]])
+
+
+def _differ(modal: ModalEstimate) -> Iterator[Finding]:
+    read, tolerance = modal.given.base_sensors, 0.0
+    if modal.calibration is not None:
+        tolerance = float(np.max(modal.calibration.tolerance[modal.given.n_sensors :][: modal.given.n_base]))
+    most = max((abs(one.gain - 1) for one in read), default=0.0)
+    if most > max(_LEAST, LIKELY * tolerance):
+        each = ", ".join(f"{one.name} {one.gain:.4g} times" for one in read)
+        yield Finding(
+            "base sensors", Severity.NOTE,
+            f"{len(read)} base sensors read the motion that is taken for that of the base differently: {each}. M, K "
+            "and C are in proportion to that motion, and wrong where these are",
+            "calibrate them and state their gains, or state their tolerance (gain_std), or leave a wrong one out",
+            numbers={"sensors": float(len(read)), "most": most, "off": max(one.off for one in read)},
+        )  # fmt: skip
 
 
 def modes_below(context: Context) -> Iterator[Finding]:

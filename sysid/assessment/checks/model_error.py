@@ -40,9 +40,8 @@ _LEAST_RATIO = 1e-4
 
 def beyond_noise(context: Context) -> Iterator[Finding]:
     """The model misses the records by more than their noise."""
-    if context.problem.stated.goal is not None and (context.named or not context.is_judged):
-        return
-    if context.has("table rocks"):
+    unjudged = context.problem.stated.goal is not None and (context.named or not context.is_judged)
+    if unjudged or context.has("table rocks"):
         return
     for miss in context.misses:
         if miss.times > BEYOND:

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.assessment.checks.context import BEYOND, Context, of_tests
-from sysid.assessment.checks.gains import distinct_poles, errors_along
+from sysid.assessment.checks.gains import distinct_poles, errors_along, tolerated_errors
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
-from sysid.measurement.gains import tolerance_of
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
@@ -60,11 +60,12 @@ def rocking_tables(context: Context) -> Iterator[Finding]:
     """The table turns as it moves along an axis: what sensors move by beside their modes rises with their places."""
     if not (context.is_explained or context.named or context.has("changing")):
         suspected = any(miss.times > BEYOND for miss in context.misses)
-        yield from of_tests([list(_told(modal.records, its, suspected)) for _, modal, its in context.fits])
+        yield from of_tests([list(_told(modal, its, suspected)) for _, modal, its in context.fits])
 
 
-def _told(test: Measurement, structure: Structure, suspected: bool) -> Iterator[Finding]:
-    for one in _found(test, structure, suspected):
+def _told(modal: ModalEstimate, structure: Structure, suspected: bool) -> Iterator[Finding]:
+    test = modal.records
+    for one in _found(modal, structure, suspected):
         along, slope = test.base_axes[one.axis], f"{one.slope:.2g}"
         if one.holds(test.rigid_body[:, one.axis]):
             yield Finding(
@@ -77,12 +78,13 @@ def _told(test: Measurement, structure: Structure, suspected: bool) -> Iterator[
             )  # fmt: skip
 
 
-def _found(test: Measurement, structure: Structure, suspected: bool, rounds: int = 5) -> list[Rocking]:
+def _found(modal: ModalEstimate, structure: Structure, suspected: bool, rounds: int = 5) -> list[Rocking]:
     """The rotation of each base direction that explains most, once another round changes none; none without positions.
 
     The first round takes the poles of the structure in and above the lines; where it shows nothing, there are no
     others, unless the model misses more than noise (`suspected`).
     """
+    test, errors = modal.records, tolerated_errors(modal)
     if test.sensors is None:
         return []
     rows, along = rigid_body(sensors=test.sensors, base_axes=BASE_AXES), np.zeros(test.rigid_body.shape)
@@ -97,7 +99,7 @@ def _found(test: Measurement, structure: Structure, suspected: bool, rounds: int
             omega, ratios = poles.omega, poles.ratios
         kept = omega >= 2 * np.pi * test.freq[test.freq > 0][0]
         inside, velocity = (omega[kept], ratios[kept]), not structure.modal_damping
-        every = [_of_axis(turned, inside, axis, rows, along[:, axis], velocity) for axis in range(test.n_base)]
+        every = [_of_axis(turned, inside, axis, rows, along[:, axis], errors, velocity) for axis in range(test.n_base)]
         found, along = [one for one in every if one is not None], np.zeros(along.shape)
         for one in found:
             along[:, one.axis] = one.slope * one.rows
@@ -108,16 +110,16 @@ def _found(test: Measurement, structure: Structure, suspected: bool, rounds: int
 
 
 def _of_axis(
-    test: Measurement, poles: tuple[Array, Array], axis: int, rows: Array, along: Array, velocity: bool
-) -> Rocking | None:
+    test: Measurement, poles: tuple[Array, Array], axis: int, rows: Array, along: Array, within: tuple[Array, Array],
+    velocity: bool,
+) -> Rocking | None:  # fmt: skip
     """The rotation beside motion along an axis that explains most of what sensors move by; None where chance does."""
-    G, n, ones = test.rigid_body[:, axis] - along, test.n_sensors, np.zeros(test.rigid_body.shape)
+    G, ones, (taken, tolerance) = test.rigid_body[:, axis] - along, np.zeros(test.rigid_body.shape), within
     ones[:, axis] = 1.0
     errors = errors_along(test, poles, ones, velocity=velocity)
     if errors is None or not np.all(np.isfinite(errors[1])):
         return None
-    tolerance = np.hypot(tolerance_of(test)[:n], tolerance_of(test)[n + axis])
-    moved, noise = errors[0] + along, np.hypot(errors[1], tolerance * np.abs(G))
+    moved, noise = errors[0] + along + taken * G, np.hypot(errors[1], tolerance * np.abs(G))
     found = []
     for turn in BASE_AXES[3:]:
         its = rows[:, BASE_AXES.index(turn)]
