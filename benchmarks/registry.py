@@ -229,6 +229,7 @@ BENCHMARKS = (
     Benchmark(
         "channels.brackets", "a sensor on a soft bracket: named with redundancy, none of sound tests", "20 min", "15 s"
     ),
+    Benchmark("channels.rocking", "tables that rock: told by their rotation, straight ones not", "15 min", "40 s"),
     Benchmark("channels.damaged", "damaged samples: kind and channel told; nothing of sound tests", "6 min", "20 s"),
     Benchmark(
         "laboratory.reader_files", "files of laboratories and their broken twins: right, or one line", "10 s", "10 s"

@@ -27,7 +27,7 @@ Kind = Literal[
     # What is to be known besides.
     "fixed", "strategy", "search", "ending", "on a bound", "search box", "level", "lines left out",
     "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio",
-    "gain not shown", "noise not judged", "modes below", "amplitude law", "linear",
+    "gain not shown", "base sensors", "noise not judged", "modes below", "amplitude law", "linear",
     # What an answer takes for granted.
     "assumed total", "assumed mass", "assumed gain", "assumed force gain", "assumed mounting", "assumed base",
 ]  # fmt: skip

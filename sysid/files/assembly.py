@@ -17,7 +17,8 @@ from sysid.files.alignment import UnitColumns, clock_moves
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
-from sysid.measurement.spectra import TimeRun, on_one_clock
+from sysid.measurement.measurement import BaseSensor
+from sysid.measurement.spectra import FORCE_NEEDED, TimeRun, on_one_clock
 from sysid.measurement.whole import tapered
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, rigid_motion, sensor_row
 from sysid.structure.structure import Array
@@ -40,7 +41,7 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     """
     said, remarks = described(recordings, said)
     axes = base_directions(said)
-    runs, table, rates = [], [], []
+    runs, table, rates, of_base = [], [], [], list[tuple[BaseSensor, ...]]()
     for recording in recordings:
         rates.append(recorded_rate(recording, said))
         records, rows = _records(recording, said)
@@ -53,7 +54,8 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
         parts = list(zip(said.channels, records, strict=True))
         runs.append(run_of(parts, said, axes, str(recording.path)))
         moving = [(channel, record - record.mean()) for channel, record in parts]  # an offset is no motion
-        remarks += base_differences(moving, said, axes, str(recording.path))
+        of_base.append(base_differences(moving, said, axes, str(recording.path)))
+        remarks += _differences_in_words(of_base[-1], axes, str(recording.path))
     if max(rates) - min(rates) > 1e-6 * max(rates):
         raise InputError(
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
@@ -62,6 +64,7 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0])), *_ends(runs, said, axes)]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks),
+        base_sensors=max(of_base, key=lambda run: max((abs(one.gain - 1) for one in run), default=0.0)),
         **tolerances_of(said, axes),
     )  # fmt: skip
 
@@ -151,7 +154,7 @@ def sensors_of(said: Description) -> tuple[Sensor, ...]:
     )
 
 
-def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Array | None]:
+def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Any]:
     """Tolerances of the gains of base and force in each direction, (d,), by their names in `RecordedTest`.
 
     Several sensors of the base, each independent of the others, share theirs: each counts by its part of the base's
@@ -287,14 +290,14 @@ def _base_motion(parts: Sequence[tuple[Channel, Any]], said: Description, axes: 
 
 def base_differences(
     parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str
-) -> list[str]:
+) -> tuple[BaseSensor, ...]:
     """Readings of more sensors of the base than it has directions, as shares of the motion that is taken for it.
 
     Records are without their means. Refused are such that have less than half in common.
     """
     base = [part for part in parts if part[0].role == "base"]
     if len(base) <= len(axes):
-        return []
+        return ()
     values = np.array([one for _, one in base])
     taken = _motions(base, said, axes) @ _base_motion(base, said, axes, place)
     sizes, off = (np.linalg.norm(one, axis=1) for one in (values, values - taken))
@@ -304,17 +307,26 @@ def base_differences(
     wrong = np.linalg.norm(off) > 0.5 * np.linalg.norm(sizes)
     refuse((wrong, f'{words} ({names}) {apart} else the base moves, such as base_axes = "x rz"'))
     gains = [float(np.real(np.vdot(b, a) / np.vdot(b, b))) for a, b in zip(values, taken, strict=True)]
-    each = zip(base, gains, off / sizes, strict=True)
-    read = ", ".join(f"{one.name!r} {gain:.4g} times (off by {100 * share:.2g} %)" for (one, _), gain, share in each)
-    words += f" read the motion that is taken for that of the base: {read}"
-    return [words]
+    shares = zip(base, gains, off / sizes, strict=True)
+    return tuple(BaseSensor(one.name, gain, float(share)) for (one, _), gain, share in shares)
+
+
+def _differences_in_words(read: Sequence[BaseSensor], axes: Sequence[str], place: str) -> list[str]:
+    """A remark on what `base_differences` found."""
+    each = ", ".join(f"{one.name!r} {one.gain:.4g} times (off by {100 * one.off:.2g} %)" for one in read)
+    words = (
+        f"{place}: {len(read)} base sensors along {' '.join(axes)} read the motion that is taken for that of the base"
+    )
+    return [f"{words}: {each}"] * bool(read)
 
 
 def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """The sum of the load cells along the base's directions, (d, n)."""
     cells = _motions(parts, said, axes)
+    known = np.linalg.matrix_rank(cells)
     unseen = [axis for axis, column in zip(axes, cells.T, strict=True) if not np.any(column)]
-    refuse((unseen, f"{place}: no force sensor acts along {' '.join(unseen)}: measure it there too, or give no force"))
+    where = f"along {' '.join(unseen)}" if unseen else f"apart enough: they tell {known} of {' '.join(axes)}"
+    refuse((known < len(axes), f"{place}: no force sensor acts {where}: {FORCE_NEEDED}"))
     return cells.T @ np.array([values for _, values in parts])
 
 

@@ -15,7 +15,7 @@ from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.damaged_runs import DamagedChannel, damage_of_runs, names_of_channels
 from sysid.measurement.excited_band import excited_band
-from sysid.measurement.measurement import Measurement
+from sysid.measurement.measurement import BaseSensor, Measurement
 from sysid.measurement.spectra import TimeRun
 from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
@@ -61,6 +61,8 @@ class RecordedTest:
         What was left out, recognised or mended.
     base_gain_std, force_gain_std : (d,) or None
         Tolerances of gains: see `Measurement`; sensors state theirs.
+    base_sensors : tuple of BaseSensor
+        In time: see `Measurement`.
     """
 
     runs: tuple[Run, ...]
@@ -73,6 +75,7 @@ class RecordedTest:
     remarks: tuple[str, ...] = ()
     base_gain_std: Array | None = None
     force_gain_std: Array | None = None
+    base_sensors: tuple[BaseSensor, ...] = ()
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
@@ -100,7 +103,8 @@ class RecordedTest:
             assert self.sample_rate is not None
             if options.get("estimator", "records") == "records" and options.get("band") is None:
                 options["band"] = self.excited_band
-            return replace(Measurement.from_time(self.runs, self.sample_rate, **given, **options), **tolerances)
+            test = Measurement.from_time(self.runs, self.sample_rate, **given, **options)
+            return replace(test, base_sensors=self.base_sensors, **tolerances)
         band = options.pop("band", None)
         if options:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
@@ -144,6 +148,7 @@ class RecordedTest:
                 "remarks": list(self.remarks),
                 "base_gain_std": self.base_gain_std,
                 "force_gain_std": self.force_gain_std,
+                "base_sensors": [one._asdict() for one in self.base_sensors],
             },
             _FORMAT,
         )
@@ -157,7 +162,7 @@ class RecordedTest:
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
-            tree.get("force_gain_std"),
+            tree.get("force_gain_std"), tuple(BaseSensor(**one) for one in tree.get("base_sensors", ())),
         )  # fmt: skip
         test._check()
         return test

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,7 @@ from sysid.errors import (
 )
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
-from sysid.measurement.spectra import Missing, checked_deviations, checked_lines, complete, named, present
+from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -37,6 +37,17 @@ from sysid.structure.sensor import (
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
+
+
+class BaseSensor(NamedTuple):
+    """A sensor of the base among more than its directions need: how it reads the motion that is taken for the base's.
+
+    `gain` times that motion, and by the share `off` of its record beside it.
+    """
+
+    name: str
+    gain: float
+    off: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,6 +89,8 @@ class Measurement:
         (d,) and of the force's (d,); one number is that of all. By default those that `sensors` state, others exact.
     damage : tuple of DamagedChannel
         Damaged samples of the records of which `from_time` makes it.
+    base_sensors : tuple of BaseSensor
+        Of which the base's motion was made, where they are more than its directions.
 
     Notes
     -----
@@ -104,6 +117,7 @@ class Measurement:
     base_gain_std: Array | None = field(default=None, kw_only=True)
     force_gain_std: Array | None = field(default=None, kw_only=True)
     damage: tuple[DamagedChannel, ...] = field(default=(), kw_only=True)
+    base_sensors: tuple[BaseSensor, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -124,7 +138,8 @@ class Measurement:
         if self.force is not None:
             put("force", checked_lines("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
-                raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
+                words = f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes"
+                raise InputError(f"{words}: {FORCE_NEEDED}" if self.force.shape[1] < self.base.shape[1] else words)
         put("sensors", checked_sensors(self.sensors))
         refuse(
             (runs != response_runs, f"base has {runs} runs but response has {response_runs}"),
@@ -165,6 +180,7 @@ class Measurement:
             "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
             "force_gain_std": self.force_gain_std,
             "damage": [one.to_tree() for one in self.damage],
+            "base_sensors": [one._asdict() for one in self.base_sensors],
         }  # fmt: skip
 
     @classmethod
@@ -174,6 +190,7 @@ class Measurement:
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
         damage = tuple(map(DamagedChannel.from_tree, tree.get("damage", ())))
         given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
+        given["base_sensors"] = tuple(BaseSensor(**one) for one in tree.get("base_sensors", ()))
         return cls(**{**tree, **given})
 
     @property
@@ -350,7 +367,7 @@ class Measurement:
         d = H.shape[1]
         F = None if force is None else checked_lines("force", force, lines.size, read)
         if F is not None and F.shape != (d, d, lines.size):
-            raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}")
+            raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}: {FORCE_NEEDED}")
         given = (
             H,
             F,

@@ -74,7 +74,10 @@ def check_runs(
         run = sequence(f"run {place}", entry, "(base, response, force or None)", 3)
         base = _record(f"run {place}, base", run[0], d)
         response = _record(f"run {place}, response", run[1], sensors)
-        force = None if run[2] is None else _record(f"run {place}, force", run[2], d)
+        force = None if run[2] is None else np.atleast_2d(finite_array(f"run {place}, force", run[2]))
+        if force is not None and (force.ndim != 2 or force.shape[0] != d):
+            words = f"run {place}, force has shape {force.shape}; ({d}, n_samples) is needed"
+            raise InputError(f"{words}: {FORCE_NEEDED}")
         lengths = {record.shape[1] for record in (base, response, force) if record is not None}
         if len(lengths) > 1:
             raise InputError(f"run {place}: its records have different lengths {sorted(lengths)}")
@@ -340,6 +343,10 @@ def _effective_averages(window: Array, step: int, counts: Array) -> float:
 
 
 Missing = Literal["refuse", "drop"]
+FORCE_NEEDED = (
+    "measure it along each base direction, moments too, or give no force (one along some of them can be a residual of "
+    "a written model: docs/own_unknowns.md)"
+)
 
 
 def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np.bool_]]]:

@@ -273,22 +273,27 @@ def _axes_of_sensors(sensors: Sequence[Sensor], rigid_body: Array) -> tuple[str,
     return tuple(BASE_AXES[i] for i in np.argmax(alike, axis=1)) if unique else ()
 
 
-def _check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence[str]) -> None:
-    """Refuse sensors whose axes are not what their rows of `rigid_body` (n_sensors, d) say.
+def _check_axes(
+    sensors: Sequence[Sensor], given: Array, base_axes: Sequence[str], most: float = 0.5
+) -> None:  # fmt: skip
+    """Refuse sensors whose axes are not what their `given` rows of rigid_body (n_sensors, d) say.
 
     For unit translation of the base a sensor has its axis's part in that direction, wherever it is. A base that moves
-    askew to the axes has no name: its direction may be any that all rows agree on.
+    askew to the axes has no name: its direction may be any that all rows agree on. One that rocks turns besides.
     """
     moves = [i for i, name in enumerate(base_axes) if name in BASE_AXES[:3]]
     if not sensors or not moves:
         return
     names = [base_axes[i] for i in moves]
     axes = np.array([sensor_row(sensor.axis, f"sensor {sensor.name!r}")[:3] for sensor in sensors])
-    rows, wanted = rigid_body[:, moves], axes[:, base_columns(names)]
+    rows, wanted = given[:, moves], axes[:, base_columns(names)]
     off = np.abs(rows - wanted)
     directions = np.linalg.lstsq(axes, rows)[0]
     askew = np.any(np.abs(directions).max(axis=0) < 1 - _ASKEW) and np.all(np.abs(axes @ directions - rows) < _ASKEW)
-    if np.any(off > _ASKEW) and not askew:
+    rotations = rigid_body(sensors=sensors, base_axes=BASE_AXES[3:])
+    turned = rotations @ np.linalg.lstsq(rotations, rows - wanted)[0]
+    rocks = off.max() < most and np.all(np.abs(wanted + turned - rows) < _ASKEW)
+    if np.any(off > _ASKEW) and not (askew or rocks):
         i, j = map(int, np.unravel_index(int(np.argmax(off)), off.shape))
         raise InputError(
             f"sensors: {sensors[i].name!r} has the axis {sensors[i].axis!r}, but by its row of rigid_body it moves by "

@@ -11,6 +11,7 @@ import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid.cli import main as cli
 from sysid.files import reading, units
+from sysid.files.recorded_test import load
 
 G = 9.80665
 A, B = np.round(np.random.default_rng(4).standard_normal((2, 96)), 6)
@@ -148,6 +149,10 @@ def test_base_sensors_of_one_axis_are_told_by_their_differences(tmp_path):
     test = reading.gather(tmp_path / "near.npz", said)
     np.testing.assert_allclose(test.runs[0][0][0], G * A / 0.98, rtol=1e-12)
     assert sum("'a' 0.98 times (off by 2 %), 'c' 1.02 times (off by 2 %)" in one for one in test.remarks) == 1
+    (tmp_path / "test.h5").write_bytes(test.to_bytes())
+    kept = load(tmp_path / "test.h5").measurement(estimator="spectra").base_sensors
+    assert [one.name for one in kept] == ["a", "c"]
+    np.testing.assert_allclose([one[1:] for one in kept], [[0.98, 0.02 / 0.98], [1.02, 0.02 / 1.02]], rtol=1e-9)
     with pytest.raises(sysid.InputError, match=r"\('a', 'c'\) share less than half"):
         reading.gather(tmp_path / "turned.npz", said)
 

@@ -13,6 +13,7 @@ from sysid.assessment.checks import (
     gains,
     mistakes,
     model_error,
+    rocking,
     search_end,
     stated,
 )
@@ -26,6 +27,7 @@ CHECKS: tuple[Check, ...] = (
     stated.keeping_bounds,
     model_error.changing_frequencies,
     model_error.laws_of_amplitude,
+    rocking.rocking_tables,
     brackets.soft_brackets,
     stated.stated_masses,
     search_end.missed_goal,
@@ -40,6 +42,7 @@ CHECKS: tuple[Check, ...] = (
     search_end.untried_modes,
     stated.on_a_bound,
     search_end.search_boxes,
+    gains.base_sensors,
     gains.modes_below,
     model_error.other_levels,
     search_end.lines_left_out,

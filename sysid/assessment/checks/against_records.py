@@ -17,7 +17,6 @@ from sysid.assessment.checks.gains import (
     below_lines,
     distinct_poles,
     gain_errors,
-    rocking_table,
     wrong_gains,
 )
 from sysid.assessment.checks.stated import MISFIT, force_misfit, pressure_of
@@ -70,10 +69,9 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     free = records.fit(*poles, velocity=velocity)
     errors = None if changing else gain_errors(modal, structure)  # which a change of frequencies would explain
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
-    rocking = [] if errors is None else list(rocking_table(test, errors))
-    if not (changing or rocking or below_lines(test, structure).size):
+    if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
-    gains = rocking or ([] if rigid or errors is None else list(wrong_gains(test, errors)))
+    gains = [] if rigid or errors is None else list(wrong_gains(test, errors))
     found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):

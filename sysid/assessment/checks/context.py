@@ -251,11 +251,11 @@ class Context:
 
     @property
     def is_explained(self) -> bool:
-        """True where nothing more is to be told: no fit to judge, bounds that keep it, a soft bracket, a named mistake.
+        """True where nothing more is to be told: no fit to judge, bounds that keep it, or a mistake that was named.
 
-        Beside that mistake averages over segments are looked at all the same, for their leakage.
+        Beside one named before the search averages over segments are looked at all the same, for their leakage.
         """
-        if not self.is_judged or self.has("bounds", "soft bracket"):
+        if not self.is_judged or self.has("bounds", "table rocks", "soft bracket"):
             return True
         return bool(self.named) and not self.problem.screened.measurement.averaged
 

@@ -22,7 +22,6 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gains_and_slopes, modes_above
-from sysid.structure.sensor import BASE_AXES, rigid_body
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
@@ -95,12 +94,19 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     share it are counted as such; noise that is stated larger counts as stated. What was taken off the records within
     stated tolerances is a part of the errors.
     """
-    found, calibration = _of_left(modal, structure), modal.calibration
-    if calibration is None:
+    found = _of_left(modal, structure)
+    if modal.calibration is None:
         return found
-    H, taken = seen_at_sensors(modal.records), calibration.seen(modal.records)
-    tolerance = np.sqrt(H**2 @ calibration.tolerance**2)
+    taken, tolerance = tolerated_errors(modal)
     return replace(found, error=(1 + found.error) * (1 + taken) - 1, tolerance=tolerance)
+
+
+def tolerated_errors(modal: ModalEstimate) -> tuple[Array, Array]:
+    """Errors of sensors' gains against the base that were taken off, and their tolerances, (n_sensors,) each."""
+    calibration, seen = modal.calibration, seen_at_sensors(modal.records)
+    if calibration is None:
+        return np.zeros(len(seen)), np.zeros(len(seen))
+    return calibration.seen(modal.records), np.sqrt(seen**2 @ calibration.tolerance**2)
 
 
 def _of_left(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -115,23 +121,35 @@ def _of_left(modal: ModalEstimate, structure: Structure) -> GainErrors:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom, zero)
-    records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
+    found = errors_along(test, distinct_poles(structure), test.rigid_body, velocity=not structure.modal_damping)
+    return unknown if found is None else GainErrors(*found, zero)
+
+
+def errors_along(
+    test: Measurement, poles: tuple[Array, Array], rigid: Array, *, velocity: bool = False
+) -> tuple[Array, Array, Array, int] | None:
+    """By how much each sensor moves with the base as `rigid` (n_sensors, d) says beside modes at these poles.
+
+    Times `rigid`, deviation, and how much may well be, (n_sensors,) each, and degrees of freedom; None of few lines.
+    With `velocity` residues in quadrature are free too. See `gain_errors`.
+    """
+    records = Records(test)
     count = poles[0].size * test.n_base * (1 + velocity)
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 3 * test.n_base):
-        return unknown
+        return None
     free = records.fit(*poles, velocity=velocity)
     above = modes_above(test.freq, test.freq[-1])
     ones, rising = (records.basis(part + 0j) for part in (np.ones((1, test.freq.size)), above))
     slopes = records.basis(gains_and_slopes(test.freq, *poles)[1][: 0 if velocity else None])
-    plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
+    plain, plain_std, least = _estimate(test, rigid, records, free, free.Q, ones, slopes)
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
-    error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
+    error, std, least_beside = _estimate(test, rigid, records, free, both, ones, slopes)
     possible = np.max(np.nan_to_num([_beyond(plain, least), _beyond(error, least_beside)]), axis=0)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
     error, std = np.where(better, plain, error), np.where(better, plain_std, std)
     freedom = (len(records.data) - free.Q.shape[1] - rising.shape[1]) * (records.data.shape[1] // test.n_sensors)
-    return GainErrors(error, std, possible, freedom, zero)
+    return error, std, possible, freedom
 
 
 def _beyond(error: Array, std: Array) -> Array:
@@ -146,9 +164,31 @@ def below_lines(test: Measurement, structure: Structure) -> Array:
     return np.sort(f[f < test.freq[test.freq > 0][0]])
 
 
+def base_sensors(context: Context) -> Iterator[Finding]:
+    """Sensors of one motion of the base differ, by more than their tolerance."""
+    problem = context.problem
+    yield from of_tests([list(_differ(one)) for one in problem.modal[problem.first_test - 1 :]])
+
+
+def _differ(modal: ModalEstimate) -> Iterator[Finding]:
+    read, tolerance = modal.given.base_sensors, 0.0
+    if modal.calibration is not None:
+        tolerance = float(np.max(modal.calibration.tolerance[modal.given.n_sensors :][: modal.given.n_base]))
+    most = max((abs(one.gain - 1) for one in read), default=0.0)
+    if most > max(_LEAST, LIKELY * tolerance):
+        each = ", ".join(f"{one.name} {one.gain:.4g} times" for one in read)
+        yield Finding(
+            "base sensors", Severity.NOTE,
+            f"{len(read)} base sensors read the motion that is taken for that of the base differently: {each}. M, K "
+            "and C are in proportion to that motion, and wrong where these are",
+            "calibrate them and state their gains, or state their tolerance (gain_std), or leave a wrong one out",
+            numbers={"sensors": float(len(read)), "most": most, "off": max(one.off for one in read)},
+        )  # fmt: skip
+
+
 def modes_below(context: Context) -> Iterator[Finding]:
     """Modes lie below the lines, where signs, gains and the rigid-body mass cannot be told from what they add."""
-    if context.is_judged:
+    if context.is_judged and not context.has("table rocks"):
         yield from of_tests([list(_below(modal.records, its)) for _, modal, its in context.fits])
 
 
@@ -228,40 +268,6 @@ def _of_base(name: str, error: float, errors: GainErrors, driven: NDArray[np.boo
     )  # fmt: skip
 
 
-def rocking_table(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
-    """Errors of gains rise with the sensors' places, as a rotation of the table with its motion along an axis makes."""
-    for axis in range(test.n_base):
-        if errors.of_base(_driven(test, axis)) is None:
-            yield from _rocking(test, errors, axis)
-
-
-def _rocking(test: Measurement, errors: GainErrors, axis: int, most: float = 0.5) -> Iterator[Finding]:
-    known = _driven(test, axis) & np.isfinite(errors.error)
-    if test.sensors is None or np.count_nonzero(known) < 3 or not np.any(known[errors.wrong]):
-        return
-    rows = rigid_body(sensors=test.sensors, base_axes=BASE_AXES)
-    error, std = errors.error[known], np.hypot(errors.std, errors.tolerance)[known]
-    for turn in [name for name in BASE_AXES[3:] if name not in test.base_axes]:
-        arm = rows[known, BASE_AXES.index(turn)] / test.rigid_body[known, axis]
-        if np.ptp(arm) <= NEGLIGIBLE * np.abs(arm).max(initial=0.0):
-            continue  # as of one error of all
-        weight, likely = (arm / std) ** 2, most_deviations(error.size)
-        size, slope = float(weight.sum()), float(np.sum(arm * error / std**2) / weight.sum())
-        # Without any one sensor too, which might be wrong by itself.
-        others = (np.sum(arm * error / std**2) - arm * error / std**2) / np.sqrt(np.maximum(size - weight, 1e-300))
-        alike = np.all(np.abs(error - slope * arm) < likely * std)
-        if alike and np.all(np.abs(others) > likely) and np.abs(slope * arm).max() < most:
-            yield Finding(
-                "table rocks", Severity.CONTRADICTS,
-                f"the sensors' gains against the base {test.base_axes[axis]} rise with their places: your table rocks "
-                f"about {turn[1]} by about {slope:.2g} rad/m (standard deviation {size**-0.5:.1g}) as it moves along "
-                f"{test.base_axes[axis]}",
-                f"record its rotation and state it as a base direction ({turn}), or stiffen its guides",
-                channel=f"base {test.base_axes[axis]}", numbers={"slope": slope, "std": size**-0.5},
-            )  # fmt: skip
-            return
-
-
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
     """By how many of its deviations the diagonal of M_SS moves at most where it moves by `by_gain`, (n_sensors,).
 
@@ -298,18 +304,20 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
             )  # fmt: skip
 
 
-def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Array:
-    """Errors of the gains beside functions Q (rows, columns), their deviations, and these by the noise alone.
+def _estimate(
+    test: Measurement, rigid: Array, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array
+) -> Array:  # fmt: skip
+    """Errors along `rigid` beside functions Q (rows, columns), their deviations, and these by the noise alone.
 
     The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
     """
     each = records.data.shape[1] // test.n_sensors
     by_sensor = lambda x: np.sum(x, axis=-2).reshape(*x.shape[:-2], each, test.n_sensors).sum(axis=-2)  # noqa: E731
-    rigid, beside = _rigid_motion(test, records), less(Q, free.left)
+    moved_so, beside = _rigid_motion(rigid, records), less(Q, free.left)
     extra, slopes = less(Q, ones), less(Q, slopes)
-    column = extra @ rigid
+    column = extra @ moved_so
     size = by_sensor(column**2)
-    observable = size > MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
+    observable = size > MIMICKED**2 * by_sensor((ones @ moved_so) ** 2)
     column *= np.tile(observable, each)
     size[~observable] = 1.0
     moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
@@ -344,11 +352,11 @@ def less(Q: Array, columns: Array) -> Array:
     return columns - Q @ (Q.T @ columns)
 
 
-def _rigid_motion(test: Measurement, records: Records) -> Array:
-    """The weighted records of sensors that move as G says, by the inputs of `records`, (inputs, channels)."""
+def _rigid_motion(rigid: Array, records: Records) -> Array:
+    """The weighted records of sensors that move as `rigid` says, by the inputs of `records`, (inputs, channels)."""
     if records.unit:
-        return test.rigid_body.T.reshape(1, -1) * records.channel
-    return np.linalg.pinv(records.moving) @ test.rigid_body.T * records.channel
+        return rigid.T.reshape(1, -1) * records.channel
+    return np.linalg.pinv(records.moving) @ rigid.T * records.channel
 
 
 def _variance(products: Array) -> Array:
