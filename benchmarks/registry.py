@@ -232,6 +232,14 @@ BENCHMARKS = (
         "laboratory.reader_files", "files of laboratories and their broken twins: right, or one line", "10 s", "10 s"
     ),
     Benchmark(
+        "laboratory.kinds_of_test",
+        "nine kinds of test as their files, by the command line, beside the truth",
+        "3 h",
+        "20 s",
+        timed=True,
+        reduced_timed=False,
+    ),
+    Benchmark(
         "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "10 min", "15 s"
     ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
