@@ -61,6 +61,10 @@ class RecordedTest:
         What was left out, recognised or mended.
     base_gain_std, force_gain_std : (d,) or None
         Tolerances of gains: see `Measurement`; sensors state theirs.
+    response_std, force_std : (runs, n_sensors, n), (runs, d, n) or None
+        Standard deviations of spectra, by the coherences of their files.
+    averaged : bool
+        Whether spectra are averages over segments under a window.
     """
 
     runs: tuple[Run, ...]
@@ -73,6 +77,9 @@ class RecordedTest:
     remarks: tuple[str, ...] = ()
     base_gain_std: Array | None = None
     force_gain_std: Array | None = None
+    response_std: Array | None = None
+    force_std: Array | None = None
+    averaged: bool = False
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
@@ -106,6 +113,7 @@ class RecordedTest:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
         parts: Any = zip(*self.runs, strict=True)
         base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
+        given |= {"response_std": self.response_std, "force_std": self.force_std, "averaged": self.averaged}
         test = Measurement(self.freq, base, response, force=force, **given, **tolerances)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
@@ -144,6 +152,9 @@ class RecordedTest:
                 "remarks": list(self.remarks),
                 "base_gain_std": self.base_gain_std,
                 "force_gain_std": self.force_gain_std,
+                "response_std": self.response_std,
+                "force_std": self.force_std,
+                "averaged": self.averaged,
             },
             _FORMAT,
         )
@@ -157,7 +168,7 @@ class RecordedTest:
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
-            tree.get("force_gain_std"),
+            tree.get("force_gain_std"), tree.get("response_std"), tree.get("force_std"), tree.get("averaged", False),
         )  # fmt: skip
         test._check()
         return test
