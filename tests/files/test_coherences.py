@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from laboratory import FREQ, F, H, function, write_universal
 
+import sysid
 from sysid.errors import InputError
 from sysid.files import reading, recorded_test
 from sysid.measurement.spectra import std_of_functions
@@ -100,3 +101,15 @@ def test_a_window_or_number_that_is_none_is_refused(tmp_path, given, words):
 def test_a_coherence_above_one_is_refused_with_its_place(tmp_path):
     with pytest.raises(InputError, match=r"Coherence\(h1\).*between 0 and 1"):
         reading.gather(table(tmp_path / "a.csv", coherence=COHERENCE + 0.2), said(averages=AVERAGES))
+
+
+def test_functions_in_python_take_coherences_too():
+    given = {"rigid_body": np.ones((3, 1)), "force": F[None, None], "averages": AVERAGES}
+    test = sysid.Measurement.from_frf(FREQ, H, coherence=COHERENCE[:3, None], force_coherence=COHERENCE[3], **given)
+    np.testing.assert_allclose(test.response_std[0], EXPECTED[:3], rtol=1e-9)
+    np.testing.assert_allclose(test.force_std[0], EXPECTED[3:], rtol=1e-9)
+    assert test.averaged
+    with pytest.raises(InputError, match="averages"):
+        sysid.Measurement.from_frf(FREQ, H, rigid_body=np.ones((3, 1)), coherence=0.9)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        sysid.Measurement.from_frf(FREQ, H, coherence=1.2, **given)
