@@ -113,7 +113,7 @@ class RecordedTest:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
         parts: Any = zip(*self.runs, strict=True)
         base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
-        given |= {"response_std": self.response_std, "force_std": self.force_std, "averaged": self.averaged}
+        given |= dict(response_std=self.response_std, force_std=self.force_std, averaged=self.averaged)
         test = Measurement(self.freq, base, response, force=force, **given, **tolerances)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
@@ -152,8 +152,7 @@ class RecordedTest:
                 "remarks": list(self.remarks),
                 "base_gain_std": self.base_gain_std,
                 "force_gain_std": self.force_gain_std,
-                "response_std": self.response_std,
-                "force_std": self.force_std,
+                "std": {"response": self.response_std, "force": self.force_std},
                 "averaged": self.averaged,
             },
             _FORMAT,
@@ -163,12 +162,12 @@ class RecordedTest:
     def from_tree(cls, tree: Tree) -> RecordedTest:
         """The test of the tree that a file holds."""
         runs = tuple((run["base"], run["response"], run["force"]) for run in tree["runs"])
-        table = tuple(ChannelRow(**row) for row in tree["table"])
+        table, std = tuple(ChannelRow(**row) for row in tree["table"]), tree.get("std", {})
         test = cls(
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
-            tree.get("force_gain_std"), tree.get("response_std"), tree.get("force_std"), tree.get("averaged", False),
+            tree.get("force_gain_std"), std.get("response"), std.get("force"), tree.get("averaged", False),
         )  # fmt: skip
         test._check()
         return test
