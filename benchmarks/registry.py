@@ -238,6 +238,14 @@ BENCHMARKS = (
         "laboratory.growing_errors", "stepped sines read to a share: modes, intervals, judgement", "3 min", "20 s"
     ),
     Benchmark(
+        "laboratory.kinds_of_test",
+        "nine kinds of test as their files, by the command line, beside the truth",
+        "3 h",
+        "20 s",
+        timed=True,
+        reduced_timed=False,
+    ),
+    Benchmark(
         "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "10 min", "15 s"
     ),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),

@@ -294,6 +294,13 @@ def _add_read(command: Adder) -> None:
     read.add_argument("--frf", metavar="FORM", help="of frequency responses: transmissibility, accelerance, mobility, "
                       "receptance, apparent mass")  # fmt: skip
     read.add_argument("--convention", metavar="SIGN", help='of spectra: "exp(+iwt)" or "exp(-iwt)"')
+    read.add_argument(
+        "--window", metavar="hann", help="of frequency responses that an analyser averaged: its window, hann"
+    )
+    read.add_argument(
+        "--averages", type=int, metavar="N",
+        help="of how many independent segments: coherences in the files then tell the noise",
+    )  # fmt: skip
 
 
 def _add_refine(command: Adder) -> None:

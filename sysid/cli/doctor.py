@@ -11,16 +11,17 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.starting import MISTAKE, SUCCESS
 from sysid.errors import InputError, how_to_install
 from sysid.files.assembly import recorded_rate
-from sysid.files.description import asked
+from sysid.files.description import Description, asked
 from sysid.files.kind import channels_of, coarse_lines, kind_of
 from sysid.files.reading import gather, recordings_of
+from sysid.files.recording import Recording
 from sysid.results.version import __version__
 
 _PACKAGE = "structural-sysid"
@@ -95,7 +96,7 @@ def _look(names: list[str], out: Output) -> int:
     files = [Path(name) for name in names]
     said, missing, runs = asked(None, files), list[str](), []
     base = [str(channel.column) for channel in said.channels if channel.role == "base"]
-    for one in recordings_of(files, said):
+    for one in _recordings(files, said):
         kind, channels, rate = kind_of(one, base), channels_of(one), ""
         if one.freq is None:
             with _collecting(missing):
@@ -113,6 +114,17 @@ def _look(names: list[str], out: Output) -> int:
     out.answer(runs=runs, missing=missing)
     out.write("".join(f"missing: {one}\n" for one in dict.fromkeys(missing)) or "'sysid read' takes them as they are\n")
     return SUCCESS
+
+
+def _recordings(files: list[Path], said: Description) -> list[Recording]:
+    """The recordings of files, beside which the list of sensors may be that of others, with another word for time."""
+    others = replace(said, time=None)
+    try:
+        found = recordings_of(files, said)
+    except InputError:
+        return recordings_of(files, others)
+    named = not isinstance(said.time, str) or any(said.time in one.names for one in found)
+    return found if named else recordings_of(files, others)
 
 
 @contextlib.contextmanager

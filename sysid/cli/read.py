@@ -53,6 +53,7 @@ def _said(options: argparse.Namespace) -> Any:
         "sample_rate": options.rate, "time": options.time, "frequency": options.frequency, "join": options.join,
         "align": options.align,
         "base_axes": options.base_axes, "frf": options.frf, "convention": options.convention,
+        "window": options.window, "averages": options.averages,
     }  # fmt: skip
     given = {name: value for name, value in given.items() if value is not None}
     if options.sensor:

@@ -164,7 +164,7 @@ def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Any]:
     force = [channel.gain_std for channel in said.channels if channel.role == "force"]
     share = None
     if any(std for _, std in base):
-        moved = _motions(base, said, axes)
+        moved = motions(base, said, axes)
         share = np.linalg.pinv(moved) * moved.T
     return {
         "base_gain_std": None if share is None else np.sqrt(share**2 @ np.array([std**2 for _, std in base])),
@@ -282,7 +282,7 @@ def run_of(
 
 def _base_motion(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """Motion of the base point from its sensors by least squares, (d, n)."""
-    seen, values = _motions(parts, said, axes), np.array([values for _, values in parts])
+    seen, values = motions(parts, said, axes), np.array([values for _, values in parts])
     words = f"the base's sensors do not show its motion along {' '.join(axes)}: each direction needs one"
     refuse((np.linalg.matrix_rank(seen) < len(axes), f"{place}: {words}"))
     return values if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ values
@@ -299,7 +299,7 @@ def base_differences(
     if len(base) <= len(axes):
         return ()
     values = np.array([one for _, one in base])
-    taken = _motions(base, said, axes) @ _base_motion(base, said, axes, place)
+    taken = motions(base, said, axes) @ _base_motion(base, said, axes, place)
     sizes, off = (np.linalg.norm(one, axis=1) for one in (values, values - taken))
     words = f"{place}: {len(base)} base sensors along {' '.join(axes)}"
     apart = "share less than half of what they record: mend a sign (axis), a unit or a gain, or state how"
@@ -322,7 +322,7 @@ def _differences_in_words(read: Sequence[BaseSensor], axes: Sequence[str], place
 
 def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str], place: str) -> Array:
     """The sum of the load cells along the base's directions, (d, n)."""
-    cells = _motions(parts, said, axes)
+    cells = motions(parts, said, axes)
     known = np.linalg.matrix_rank(cells)
     unseen = [axis for axis, column in zip(axes, cells.T, strict=True) if not np.any(column)]
     where = f"along {' '.join(unseen)}" if unseen else f"apart enough: they tell {known} of {' '.join(axes)}"
@@ -330,7 +330,7 @@ def _total_force(parts: Sequence[tuple[Channel, Any]], said: Description, axes: 
     return cells.T @ np.array([values for _, values in parts])
 
 
-def _motions(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str]) -> Array:
+def motions(parts: Sequence[tuple[Channel, Any]], said: Description, axes: Sequence[str]) -> Array:
     """Readings of channels at unit motions of the base in its directions, (channels, d)."""
     points = np.array([channel.position or (0.0, 0.0, 0.0) for channel, _ in parts])
     rows = rigid_motion(points, said.origin).reshape(len(points), 6, 6)

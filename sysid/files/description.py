@@ -8,12 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sysid.errors import InputError, as_float, choice, flag, path_of, printable, refuse, sequence, shown, text
+from sysid.errors import (
+    InputError,
+    as_float,
+    choice,
+    flag,
+    path_of,
+    printable,
+    refuse,
+    sequence,
+    shown,
+    text,
+    whole_number,
+)
 from sysid.structure.sensor import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
 _FIELDS = ("column", "name", "role", "position", "axis", "unit", "gain", "gain_std", "delay", "part", "reference")
-_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join", "align")
+_TOP = (
+    "sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "window", "averages",
+    "join", "align",
+)  # fmt: skip
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
 EXAMPLE = """\
@@ -70,6 +85,10 @@ class Description:
         The base point, m.
     frf, convention : str
         Of frequency responses, see `sysid.files.responses`; "" where they are to be recognised.
+    window : str
+        "hann" where an analyser averaged segments under that window, "" where nothing is said.
+    averages : int
+        How many independent segments; 0 where nothing is said.
     join : bool
         Whether files hold one sensor each, those of a folder or with the same rest of their names being one run.
     align : bool
@@ -84,6 +103,8 @@ class Description:
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     frf: str = ""
     convention: str = ""
+    window: str = ""
+    averages: int = 0
     join: bool = False
     align: bool = False
     place: str = "the description"
@@ -140,6 +161,11 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         base_columns(axes)
     if convention != "":
         choice(f"{place}: convention", convention, CONVENTIONS)
+    window, averages = given.get("window", ""), given.get("averages", 0)
+    if window != "":
+        choice(f"{place}: window", window, ("hann",))
+    if averages != 0:
+        whole_number(f"{place}: averages", averages, at_least=2)
     join, align = (flag(f"{place}: {name}", given.get(name, False)) for name in ("join", "align"))
     for name in ("time", "frequency"):
         wrong = given.get(name) is not None and not isinstance(given[name], str | int)
@@ -149,7 +175,7 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         None if rate is None else as_float(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
         given.get("time"), given.get("frequency"), axes if axes is None or isinstance(axes, str) else " ".join(axes),
         tuple(vector3(given.get("origin", (0.0, 0.0, 0.0)), f"{place}: origin").tolist()),
-        given.get("frf", ""), convention, join, align, place,
+        given.get("frf", ""), convention, window, averages, join, align, place,
     )  # fmt: skip
 
 

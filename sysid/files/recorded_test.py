@@ -63,6 +63,10 @@ class RecordedTest:
         Tolerances of gains: see `Measurement`; sensors state theirs.
     base_sensors : tuple of BaseSensor
         In time: see `Measurement`.
+    response_std, force_std : (runs, n_sensors, n), (runs, d, n) or None
+        Standard deviations of spectra, by the coherences of their files.
+    averaged : bool
+        Whether spectra are averages over segments under a window.
     """
 
     runs: tuple[Run, ...]
@@ -76,6 +80,9 @@ class RecordedTest:
     base_gain_std: Array | None = None
     force_gain_std: Array | None = None
     base_sensors: tuple[BaseSensor, ...] = ()
+    response_std: Array | None = None
+    force_std: Array | None = None
+    averaged: bool = False
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
@@ -110,6 +117,7 @@ class RecordedTest:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
         parts: Any = zip(*self.runs, strict=True)
         base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
+        given |= dict(response_std=self.response_std, force_std=self.force_std, averaged=self.averaged)
         test = Measurement(self.freq, base, response, force=force, **given, **tolerances)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
@@ -149,6 +157,8 @@ class RecordedTest:
                 "base_gain_std": self.base_gain_std,
                 "force_gain_std": self.force_gain_std,
                 "base_sensors": [one._asdict() for one in self.base_sensors],
+                "std": {"response": self.response_std, "force": self.force_std},
+                "averaged": self.averaged,
             },
             _FORMAT,
         )
@@ -157,12 +167,13 @@ class RecordedTest:
     def from_tree(cls, tree: Tree) -> RecordedTest:
         """The test of the tree that a file holds."""
         runs = tuple((run["base"], run["response"], run["force"]) for run in tree["runs"])
-        table = tuple(ChannelRow(**row) for row in tree["table"])
+        table, std = tuple(ChannelRow(**row) for row in tree["table"]), tree.get("std", {})
         test = cls(
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
             tree.get("force_gain_std"), tuple(BaseSensor(**one) for one in tree.get("base_sensors", ())),
+            std.get("response"), std.get("force"), tree.get("averaged", False),
         )  # fmt: skip
         test._check()
         return test

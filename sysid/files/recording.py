@@ -25,6 +25,7 @@ _PARTS = {
     "re": "real", "real": "real", "im": "imaginary", "imag": "imaginary", "imaginary": "imaginary",
     "mag": "magnitude", "magnitude": "magnitude", "abs": "magnitude", "amplitude": "magnitude", "amp": "magnitude",
     "phase": "phase", "ph": "phase", "angle": "phase", "arg": "phase",
+    "coherence": "coherence", "coh": "coherence",
 }  # fmt: skip
 _NAMED_LAST = re.compile(rf"(.+?)[\s_.,:\-]+\(?({'|'.join(_PARTS)})\)?", re.IGNORECASE)
 _NAMED_FIRST = re.compile(rf"({'|'.join(_PARTS)})(?:[\s_.,:\-]+([^\[\]()]+)|\(([^()]+)\))", re.IGNORECASE)

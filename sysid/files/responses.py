@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, choice, refuse
 from sysid.files import units
@@ -19,6 +20,7 @@ from sysid.files.assembly import (
     base_directions,
     delays_in_words,
     described,
+    motions,
     row_of,
     run_of,
     sensors_of,
@@ -28,7 +30,8 @@ from sysid.files.assembly import (
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.kind import coarse_lines
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_column
+from sysid.files.recording import Column, Recording, check_column, part_of
+from sysid.measurement.spectra import std_of_functions
 from sysid.structure.structure import Array, ComplexArray
 
 # Quantity of the numerator and of the denominator; that of a transmissibility is one and the same.
@@ -44,6 +47,18 @@ _ORDER = {"displacement": 2, "velocity": 1}  # how often to differentiate
 _OF_ROLE = {"base": "a motion", "response": "a motion", "force": "a force"}
 _MOTIONS = ("acceleration", "velocity", "displacement", "angular acceleration")
 _ENDS_WITH_AXIS = re.compile(r"(?:.*\d)?([+-]?)(r?[xyz])")
+
+
+class _Part(NamedTuple):
+    """A function of a channel, (lines,), with its coherence."""
+
+    channel: Channel
+    values: ComplexArray
+    coherence: Any
+
+    def at(self, kept: NDArray[np.bool_]) -> _Part:
+        """The same at some lines."""
+        return _Part(self.channel, self.values[kept], None if self.coherence is None else self.coherence[kept])
 
 
 def from_spectra(recordings: Sequence[Recording], said: Description) -> RecordedTest:
@@ -64,33 +79,66 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
         other = recording.freq
         if other is None or other.shape != freq.shape or not np.allclose(other, freq, rtol=1e-6):
             raise InputError(f"{recording.path} has other lines than {recordings[0].path}: read them apart")
-    runs, table = _runs(recordings, said, axes, freq)
+    runs, table, parts = _runs(recordings, said, axes, freq)
     sign, how = _convention(runs, said)
     if sign < 0:  # conjugated as they are in the file: velocities and displacements are differentiated after it
-        runs, table = _runs(recordings, said, axes, freq, conjugated=True)
+        runs, table, parts = _runs(recordings, said, axes, freq, conjugated=True)
     kept = freq > 0
     freq, runs = freq[kept], [_at(run, kept) for run in runs]
     remarks = [few for one in recordings for few in coarse_lines(one) if said.frf != "spectrum"] + remarks
     remarks += ["the line at 0 Hz is left out"] * (not np.all(kept))
-    remarks += [*delays_in_words(said), *work_of_force(runs, freq), how]
+    std, words = _deviations([[part.at(kept) for part in run] for run in parts], said, axes)
+    remarks += [*delays_in_words(said), *work_of_force(runs, freq), *words, how]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks),
-        **tolerances_of(said, axes),
+        **tolerances_of(said, axes), **std, averaged=said.window != "" or said.averages > 0,
     )  # fmt: skip
+
+
+def _deviations(
+    parts: Sequence[Sequence[_Part]], said: Description, axes: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """Standard deviations of responses and forces, (runs, rows, lines), by coherences, and what is said of them.
+
+    None where a coherence is missing, how many averages they are of, or the base's motion is a function itself.
+    """
+    every = [one for run in parts for one in run]
+    none: dict[str, Any] = {"response_std": None, "force_std": None}
+    lacking = next((one.channel.column for one in every if one.coherence is None), None)
+    unused = [
+        "the base's motion is a function itself, whose errors they do not tell"
+    ] * any(one.channel.role == "base" for one in every)  # fmt: skip
+    unused += [f"that of {lacking!r} is missing"] * (lacking is not None)
+    unused += ["state of how many independent segments they are: averages = 40 (--averages)"] * (not said.averages)
+    if unused:
+        told = any(one.coherence is not None for one in every)
+        return none, [f"coherences stand in the files and are not used: {unused[0]}"] * told
+    hann = said.window == "hann"
+    response, force = [], []
+    for run in parts:
+        std = {one.channel: std_of_functions(one.values, one.coherence, said.averages, hann=hann) for one in run}
+        named = {channel.name: values for channel, values in std.items() if channel.role == "response"}
+        response.append(np.array([named[sensor.name] for sensor in sensors_of(said)]))
+        cells = [(channel, values) for channel, values in std.items() if channel.role == "force"]
+        if cells:
+            force.append(np.sqrt(motions(cells, said, axes).T ** 2 @ np.array([values**2 for _, values in cells])))
+    words = f"noise by the coherences of {said.averages} averages{', and by what the window blurs' * hann}"
+    return {"response_std": np.array(response), "force_std": np.array(force) if force else None}, [words]
 
 
 def _runs(
     recordings: Sequence[Recording], said: Description, axes: Sequence[str], freq: Array, conjugated: bool = False
-) -> tuple[list[Run], list[ChannelRow]]:
-    """A run for each reference of each recording."""
-    runs, table = [], []
+) -> tuple[list[Run], list[ChannelRow], list[list[_Part]]]:
+    """A run for each reference of each recording, with the functions that it is made of."""
+    runs, table, every = [], [], []
     for recording in recordings:
         found = [_reference(column, said) for column in recording.columns if _is_used(column, said)]
         for reference in dict.fromkeys(found):
-            run, rows = _run(recording, reference, said, axes, freq, conjugated)
+            run, rows, parts = _run(recording, reference, said, axes, freq, conjugated)
             runs.append(run)
+            every.append(parts)
             table += rows
-    return runs, table
+    return runs, table, every
 
 
 def _is_used(column: Column, said: Description) -> bool:
@@ -108,7 +156,7 @@ def _reference(column: Column, said: Description) -> str:
 
 def _run(
     recording: Recording, reference: str, said: Description, axes: Sequence[str], freq: Array, conjugated: bool
-) -> tuple[Run, list[ChannelRow]]:
+) -> tuple[Run, list[ChannelRow], list[_Part]]:
     """Base, responses and forces per unit of a reference, in the order of the sensors."""
     found = [
         (channel, column)
@@ -119,19 +167,33 @@ def _run(
     lower = _denominator(forms, reference, recording)
     parts: list[tuple[Channel, ComplexArray]] = []
     rows: list[ChannelRow] = []
+    with_coherence: list[_Part] = []
     for (channel, column), form in zip(found, forms, strict=True):
         check_column(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor
         values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
         values = values * np.exp(2j * np.pi * freq * channel.delay)
         parts.append((channel, values))
+        with_coherence.append(_Part(channel, values, _coherence(recording, column, reference)))
         rms = float(np.sqrt(np.mean(np.abs(values) ** 2)))
         rows.append(row_of(column, channel, form.unit, form.factor, rms, recording))
     _check_responses(parts, said, reference, recording)
     has_base = any(channel.role == "base" for channel, _ in parts)
     moved = None if has_base else _unit_motion(lower, reference, axes, recording, freq)
     base_differences(parts, said, axes, str(recording.path))  # refuses
-    return run_of(parts, said, axes, str(recording.path), moved), rows
+    return run_of(parts, said, axes, str(recording.path), moved), rows, with_coherence
+
+
+def _coherence(recording: Recording, column: Column, reference: str) -> Array | None:
+    """The coherence of a function, (n,): the column of its name, such as "3+X coherence" or "Coh(h1)"."""
+    for one in recording.columns:
+        if part_of(one.name) == (column.name, "coherence") and one.reference in ("", reference):
+            check_column(one, recording.path)
+            values = np.real(one.values)
+            words = "a coherence is between 0 and 1"
+            refuse((bool(np.any((values < 0) | (values > 1.001))), f"{recording.path}, {one.place}: {words}"))
+            return values
+    return None
 
 
 def _check_responses(

@@ -19,7 +19,7 @@ from sysid.files.recording import Column, Recording, rate_of
 
 _FUNCTIONS = {0: "general", 1: "time response", 2: "auto spectrum", 3: "cross spectrum", 4: "frequency response",
               6: "coherence", 12: "spectrum"}  # fmt: skip
-_READ = (1, 4, 12)
+_READ = (1, 4, 6, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 # Data types of functions whose unit no label tells: that of the set 164, and SI without one.
 _SPECIFIC = {8: "{length}", 9: "{force}", 11: "{length}/s", 12: "{length}/s²", 13: "{force}"}
@@ -54,7 +54,8 @@ def read_universal(path: Path) -> list[Recording]:
     }
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
-    used = [(at, one) for at, one in functions if one["func_type"] in _READ]
+    beside = any(one["func_type"] == 4 for _, one in functions)  # which coherences stand
+    used = [(at, one) for at, one in functions if one["func_type"] in _READ and (beside or one["func_type"] != 6)]
     found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
     found += f", functions {', '.join(sorted(kinds))}" * bool(kinds)
     none = f"no time records or frequency responses: sets {found}; export functions as sets 58 or 58b"
@@ -65,7 +66,7 @@ def read_universal(path: Path) -> list[Recording]:
     )
     runs: dict[int, list[tuple[int, dict[str, Any]]]] = {}
     for at, one in used:
-        runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
+        runs.setdefault(one["load_case_id"] if one["func_type"] not in (4, 6) else 0, []).append((at, one))
     left_out = sorted({str(one.get("type")) for one in sets} - _KNOWN)
     remarks = (f"sets of type {', '.join(left_out)} are left out",) * bool(left_out)
     return [replace(_recording(path, run, points, file_units), remarks=remarks) for run in runs.values()]
@@ -151,7 +152,8 @@ def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], fi
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
     words = f"{values.size} of {one['num_pts']} values are there: it is cut short, or not of the precision that it says"
     refuse((values.size < one["num_pts"], f"{path}, set {at} ({name}): {words}; export it again"))
-    spectrum = one["func_type"] == 4
+    spectrum = one["func_type"] in (4, 6)
+    name += " coherence" * (one["func_type"] == 6)
     upper = _unit(one, "ordinate", file_units)
     lower = _unit(one, "orddenom", file_units) if spectrum else ""
     direction = int(one["rsp_dir"])

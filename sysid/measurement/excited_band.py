@@ -82,10 +82,17 @@ def _band_of(base: Array, sample_rate: float) -> tuple[float, float]:
         return float(freq[0]), float(freq[-1])
     levels = _levels(freq, power)
     down, up = np.arange(levels.body[1], -1, -1), np.arange(levels.body[1], levels.low.size)
-    low = _end(levels, down, levels.body[0], levels.smooth[down].min())
+    low, still = _end(levels, down, levels.body[0], levels.smooth[down].min())
     # Noise seldom rises with frequency: the quietest bins of all tell that above.
-    high = _end(levels, up, levels.body[2], levels.smooth.min())
-    return float(levels.low[low]), float(levels.high[high])
+    high, quiet = _end(levels, up, levels.body[2], levels.smooth.min())
+    first, last = np.searchsorted(freq, [levels.low[low], levels.high[high]])
+    # Bins at the ends hold lines that do not move.
+    few = min(12, last + 1 - first)
+    moves = np.convolve(power[first : last + 1], np.full(few, 1 / few), "valid")
+    begin, end = freq[first + np.flatnonzero(moves > still)[0]], freq[last - np.flatnonzero(moves[::-1] > quiet)[0]]
+    # A sweep reaches its ends where the tapers of the density vanish.
+    inside = freq[first : last + 1]
+    return float(inside[inside >= begin / 1.02][0]), float(inside[inside <= 1.02 * end][-1])
 
 
 def _density(base: Array, tapers: int = 5) -> Array:
@@ -119,8 +126,12 @@ def _levels(freq: Array, power: Array, fewest: int = 6) -> _Levels:
     )  # fmt: skip
 
 
-def _end(levels: _Levels, outward: NDArray[np.intp], inner: np.intp, quiet: float, standing: float = 4.0) -> np.intp:
-    """The last bin of the band going `outward` from the middle of its power, past the bin `inner` of its body.
+def _end(
+    levels: _Levels, outward: NDArray[np.intp], inner: np.intp, quiet: float, standing: float = 4.0
+) -> tuple[np.intp, float]:
+    """The last bin of the band going `outward` from the middle of its power, and the level of motion there, or zero.
+
+    It lies past the bin `inner` of the band's body.
 
     `standing` times the level where it is `quiet` is motion. Beyond the end it stays on a floor, rises again, or is
     below a thousandth of the motion; else all that follows belongs to it.
@@ -136,4 +147,5 @@ def _end(levels: _Levels, outward: NDArray[np.intp], inner: np.intp, quiet: floa
     # Of a stretch within 6 dB of its end a power law has half within 3 dB, a floor nearly all.
     floor = within(standing / 2) > 0.65 * within(standing)
     ends = levels.typical > standing**2 * quiet and (floor or deep or np.any(moves[last + 1 :]))
-    return outward[min(last + 1, outward.size - 1) if ends else -1]  # the next bin may hold some of its lines
+    # The next bin may hold some of its lines.
+    return (outward[min(last + 1, outward.size - 1)], standing * quiet) if ends else (outward[-1], 0.0)

@@ -14,6 +14,7 @@ from sysid.errors import (
     as_float,
     check_frequencies,
     choice,
+    finite_array,
     numbers,
     refuse,
     sequence,
@@ -342,6 +343,10 @@ class Measurement:
         force_std: ArrayLike | None = None,
         base_axes: str | Sequence[str] | None = None,
         missing: Missing = "refuse",
+        window: Literal["", "hann"] = "",
+        averages: int | None = None,
+        coherence: ArrayLike | None = None,
+        force_coherence: ArrayLike | None = None,
     ) -> Measurement:
         """From frequency response functions: d unit runs, one a base direction.
 
@@ -356,11 +361,20 @@ class Measurement:
             Apparent mass, kg: [force direction, base direction] per unit base acceleration.
         response_std, force_std : array_like, optional
             Standard deviations of `frf` and `force`, broadcast to them.
+        window, averages : str, int, optional
+            Of functions H1 that an analyser averaged: its window, and how many independent blocks.
+        coherence, force_coherence : array_like, optional
+            Coherences of `frf` and `force`, broadcast to them, which tell their deviations by `averages`:
+            ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9), and what the
+            window blurs.
         rigid_body, sensors, base_axes, missing
             As in `Measurement`.
         """
         lines = check_frequencies(freq)
         choice("missing", missing, ("refuse", "drop"))
+        choice("window", window, ("", "hann"))
+        stated = coherence is not None or force_coherence is not None
+        refuse((stated and averages is None, "coherences tell noise where averages= is given, such as 40"))
         read = numbers if missing == "drop" else complete  # lines with NaN go where the records have all runs
         H = read("frf", frf, complex)
         H = checked_lines("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
@@ -368,6 +382,13 @@ class Measurement:
         F = None if force is None else checked_lines("force", force, lines.size, read)
         if F is not None and F.shape != (d, d, lines.size):
             raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}: {FORCE_NEEDED}")
+        for name, function, known in (("coherence", H, coherence), ("force_coherence", F, force_coherence)):
+            if known is not None and function is not None:
+                seen = np.broadcast_to(finite_array(name, known), function.shape)
+                refuse((bool(np.any((seen < 0) | (seen > 1))), f"{name} is between 0 and 1"))
+                count = whole_number("averages", averages, at_least=2)
+                std = spectra.std_of_functions(function, seen, count, hann=window == "hann")
+                response_std, force_std = (std, force_std) if function is H else (response_std, std)
         given = (
             H,
             F,
@@ -379,7 +400,7 @@ class Measurement:
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
         return cls(
             lines, unit_runs(d, lines.size), by_run[0], force=by_run[1], response_std=by_run[2], force_std=by_run[3],
-            **options,
+            averaged=window != "" or stated, **options,
         )  # fmt: skip
 
     @classmethod

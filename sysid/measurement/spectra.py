@@ -199,6 +199,18 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
     )
 
 
+def std_of_functions(H: ComplexArray, coherence: Array, averages: int, *, hann: bool = False) -> Array:
+    """Standard deviations ``sqrt(E|e|²)`` of functions H1 (..., lines) by their coherences and independent averages.
+
+    ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9), and what Hann's window
+    blurs. Coherences are those of text files: above one less 1e-6 they are not told apart.
+    """
+    known = np.clip(coherence, 1e-6, 1 - 1e-6)
+    blurred = np.moveaxis(_smoothing(np.moveaxis(H, -1, 0)), 0, -1) if hann else 0.0
+    std: Array = np.sqrt(np.abs(H) ** 2 * (1 - known) / (known * averages) + blurred**2)
+    return std
+
+
 def _check_independent(S_xx: ComplexArray) -> None:
     """Refuse base spectra (n_freq, d, d) of directions that do not move, or not by themselves."""
     size = np.sqrt(np.einsum("fii->fi", S_xx).real)

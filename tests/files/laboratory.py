@@ -1,5 +1,7 @@
 """Data that tests of files share: responses of a chain of three masses on its base, and sets of universal files."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -40,3 +42,20 @@ def function(node, data, freq=FREQ, **given):
 def write_universal(path, sets):
     """Write sets as a universal file."""
     pytest.importorskip("pyuff").UFF(str(path)).write_sets(sets, "overwrite")
+
+
+def strong_motion(name, channels, step=0.02):
+    """What of the format is read, with more digits than it has."""
+    lines = ["Corrected accelerogram"]
+    for number, row in enumerate(channels, 1):
+        lines += [
+            f"Chan {number}:  360 Deg",
+            f"{row.size} points of accel data equally spaced at {step:.3f} sec, in m/sec2. (1f25.17)",
+        ]
+        lines += [*(f"{one:25.17f}" for one in row), f"End of data for channel {number}"]
+    Path(name).write_text("\n".join(lines))
+
+
+def save(name, heads, rows):
+    """Write a table with a column a row of `rows`."""
+    np.savetxt(name, np.array(rows).T, "%.12g", ",", header=",".join(heads), comments="", encoding="utf-8")

@@ -8,6 +8,7 @@ import laboratory
 import numpy as np
 import pytest
 import scipy.io
+from laboratory import save, strong_motion
 
 import sysid
 from sysid.cli import main as cli
@@ -44,22 +45,6 @@ def folder(tmp_path, monkeypatch):
     scipy.io.savemat("shaker.mat", {"freq": FREQ, "table": table, "h1": H[0] * table, "h2": H[1] * table})
     strong_motion("CE24386.V2", [base[0], channels[1]])
     return tmp_path
-
-
-def strong_motion(name, channels):
-    """What of the format is read, with more digits than it has."""
-    lines = ["Corrected accelerogram"]
-    for number, row in enumerate(channels, 1):
-        lines += [
-            f"Chan {number}:  360 Deg",
-            f"{row.size} points of accel data equally spaced at .020 sec, in m/sec2. (1f25.17)",
-        ]
-        lines += [*(f"{one:25.17f}" for one in row), f"End of data for channel {number}"]
-    Path(name).write_text("\n".join(lines))
-
-
-def save(name, heads, rows):
-    np.savetxt(name, np.array(rows).T, "%.12g", ",", header=",".join(heads), comments="", encoding="utf-8")
 
 
 def universal():

@@ -141,3 +141,11 @@ def test_a_run_in_which_the_base_rests_widens_nothing():
     )
     assert both == alone
     assert both[0] > 0.5 and both[1] < 8
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("high", [5.0, 11.3, 19.0, 23.7])
+def test_the_band_ends_close_above_the_motion(high, seed):
+    """A mode between the end of the motion and that of the band would hardly be shaken, and its mass be open."""
+    found = band(random(between(1, high), seed) + noise(3e-3, seed + 20))
+    assert high <= found[1] < 1.12 * high
