@@ -51,7 +51,8 @@ CEILINGS = {
     # and the kind of test that a file seems to be, with what is missing (125),
     # and least squares of whole records that no modes explain, and levels that quiet lines bound (130),
     # and sensors on soft brackets, rigid parts with sensors to spare, and what answers take for granted (300),
-    "lines": 46_650,
+    # and delays of many periods looked for in any case, and gains beside what a model misses (30),
+    "lines": 46_680,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 76.6,
 }
