@@ -351,9 +351,7 @@ def _of_runs(test: Measurement, records: Records) -> Array:
     if test.whole is None:
         return np.zeros((len(records.data), 0))
     weight = factors_of_runs(test.response_std, test.response.shape)[1][records.run, records.line]
-    freq, (times, _) = test.freq[records.line], test.whole.pulses(test.freq[-1])
-    x = freq / test.freq[-1]
-    traces = np.concatenate([[np.ones_like(x), 1j * x, -1j / x], np.exp(2j * np.pi * np.multiply.outer(times, freq))])
+    traces = test.whole.traces(test.freq[records.line], test.freq[-1])
     return stacked(np.concatenate([np.where(records.run == run, weight * traces, 0.0) for run in range(test.n_runs)]))
 
 

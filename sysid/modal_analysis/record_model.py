@@ -77,9 +77,9 @@ class RecordModel(SpectralModel):
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
         self.by_gains = read_by_gains(test)
-        self.pulses, reached = self.whole.pulses(test.freq[-1])
+        reached = self.whole.pulses(test.freq[-1])[1]
         self._place(static, trace_count(test), gains=gains, coupled=coupled)
-        if self.pulses.size:  # a run that begins and ends at rest has none
+        if reached.size:  # a run that begins and ends at rest has none
             of_channels = np.append(reached, np.repeat(reached[self.n :], self.d - 1, axis=0), axis=0)
             own = of_channels & np.isin(np.arange(test.n_runs), self.whole.moving)[:, None, None]
             traces = np.concatenate([np.ones((*own.shape[:2], TRACES), bool), own], axis=2)
@@ -109,10 +109,8 @@ class RecordModel(SpectralModel):
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """Spectra of which the traces of a channel are multiples, (traces, L): last those of turned records' ends."""
-        unit = freq / self.test.freq[-1]
-        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
-        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses[:, None] * freq)])
+        """See `SpectralModel`."""
+        return self.whole.traces(freq, self.test.freq[-1])
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
