@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import io
 import multiprocessing
-import threading
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -76,17 +74,9 @@ def _measure(benchmark: Benchmark, reduced: bool) -> End:
 
 
 def _captured(benchmark: Benchmark, reduced: bool) -> tuple[str, End]:
-    """One benchmark in a process beside others: what it would print, and its end.
-
-    Pools that it left are ended by threads of theirs: a process that ends meanwhile takes their queues away, and their
-    workers wait for ever.
-    """
+    """One benchmark in a process beside others: what it would print, and its end."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         end = _measure(benchmark, reduced)
-    gc.collect()
-    for thread in threading.enumerate():
-        if thread is not threading.current_thread() and not thread.daemon:
-            thread.join(60)
     return printed.getvalue(), end
 
 

@@ -17,10 +17,9 @@ from sysid.files.alignment import UnitColumns, clock_moves
 from sysid.files.description import ROLES, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_column, is_abscissa, is_time, rate_of
-from sysid.measurement.measurement import BaseSensor
 from sysid.measurement.spectra import FORCE_NEEDED, TimeRun, on_one_clock
 from sysid.measurement.whole import tapered
-from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, rigid_motion, sensor_row
+from sysid.structure.sensor import BASE_AXES, BaseSensor, Sensor, base_columns, rigid_body, rigid_motion, sensor_row
 from sysid.structure.structure import Array
 
 _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign

@@ -15,9 +15,17 @@ from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.damaged_runs import DamagedChannel, damage_of_runs, names_of_channels
 from sysid.measurement.excited_band import excited_band
-from sysid.measurement.measurement import BaseSensor, Measurement
+from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import TimeRun
-from sysid.structure.sensor import BASE_AXES, Sensor, base_columns, rigid_body, sensors_from_tree, sensors_to_tree
+from sysid.structure.sensor import (
+    BASE_AXES,
+    BaseSensor,
+    Sensor,
+    base_columns,
+    rigid_body,
+    sensors_from_tree,
+    sensors_to_tree,
+)
 from sysid.structure.structure import Array
 
 _FORMAT = 1

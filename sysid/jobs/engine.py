@@ -12,6 +12,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from multiprocessing.context import BaseContext
 from multiprocessing.util import Finalize
+from threading import Thread
 from typing import Any, TypeVar, cast
 
 from sysid.errors import InputError, needed, whole_number
@@ -81,9 +82,18 @@ class _Processes(ProcessPoolExecutor):
 
     def __init__(self, count: int, context: BaseContext) -> None:
         super().__init__(count, context, initializer=_end_at_interrupt)
-        # At its end a process of multiprocessing ends its queues, with priority 10, and waits for its children: workers
-        # that still waited for tasks would do so for ever.
-        Finalize(self, _shut, (weakref.ref(self),), exitpriority=20)
+
+    def _start_executor_manager_thread(self) -> None:
+        """Start the thread that ends the workers, now or where the pool is dropped, with the first task.
+
+        At its end a process of multiprocessing ends its queues, with priority 10, and waits for its children: workers
+        that this thread had not ended by then would wait for ever.
+        """
+        before = self._executor_manager_thread
+        super()._start_executor_manager_thread()
+        if before is None:
+            thread = cast(Thread, self._executor_manager_thread)
+            Finalize(thread, _wait_for, (weakref.ref(self), weakref.ref(thread)), exitpriority=20)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no further tasks."""
@@ -104,10 +114,12 @@ class _Processes(ProcessPoolExecutor):
                 worker.terminate()
 
 
-def _shut(pool: weakref.ref[_Processes]) -> None:
-    """Shut a pool down that is still there at this process's end."""
+def _wait_for(pool: weakref.ref[_Processes], thread: weakref.ref[Thread]) -> None:
+    """Shut a pool down that is still there at this process's end, and wait for its thread, if it was dropped too."""
     if (left := pool()) is not None:
         left.shutdown()
+    if (ending := thread()) is not None:
+        ending.join()
 
 
 @contextmanager

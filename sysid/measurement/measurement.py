@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,7 @@ from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations,
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
+    BaseSensor,
     Sensor,
     axes_of_base,
     checked_sensors,
@@ -38,17 +39,6 @@ from sysid.structure.sensor import (
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
-
-
-class BaseSensor(NamedTuple):
-    """A sensor of the base among more than its directions need: how it reads the motion that is taken for the base's.
-
-    `gain` times that motion, and by the share `off` of its record beside it.
-    """
-
-    name: str
-    gain: float
-    off: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -500,14 +490,3 @@ def stated_delays(sensors: Sequence[Sensor] | None, count: int) -> Array:
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
     """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
-
-
-def without_delays(test: Measurement, delays: Array) -> Measurement:
-    """The test with each channel earlier by its delay, s: of the sensors, then, where there is one, of the force.
-
-    Spectra of whole records are turned about: a record that begins earlier holds its beginning at its end. `taken` of
-    its `WholeRecords` says so, and their model has the samples there for unknowns.
-    """
-    turn = np.exp(2j * np.pi * delays[:, None] * test.freq)
-    force, whole = (None if test.force is None else test.force * turn[-1]), test.whole and test.whole.earlier(delays)
-    return replace(test, response=test.response * turn[: test.n_sensors], force=force, whole=whole)

@@ -101,7 +101,7 @@ class WholeRecords:
     grows: bool = field(default=False)
 
     @property
-    def traces(self) -> int:
+    def of_sampling(self) -> int:
         """Real numbers of each channel and run that sampling and detrending leave: of 1, i w and 1 / (i w)."""
         return 3
 
@@ -165,6 +165,15 @@ class WholeRecords:
         at, width = np.concatenate(times), np.concatenate(spacing)
         return at, (taken[:, None] * at > 0) & (np.abs(at) < np.abs(taken[:, None]) + width / 2)
 
+    def traces(self, freq: Array, last: float) -> ComplexArray:
+        """Spectra at lines in Hz of which a channel of a run holds multiples beside its response, (3 + k, n).
+
+        Those of sampling, 1, i w and 1 / (i w), for lines up to `last`, Hz, and then those of the `pulses`.
+        """
+        unit = freq / last
+        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])[: self.of_sampling]
+        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses(last)[0][:, None] * freq)])
+
     def to_tree(self) -> dict[str, Any]:
         """Give it as dictionaries and arrays; `from_tree` takes it back."""
         return {
@@ -194,7 +203,7 @@ class SteadyLines(WholeRecords):
         return cls((1,) * runs, float(np.diff(freq).min()), (True,) * runs, grows=grows)
 
     @property
-    def traces(self) -> int:
+    def of_sampling(self) -> int:
         """None: see `WholeRecords`."""
         return 0
 

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.in_time import as_whole
-from sysid.measurement.measurement import Measurement, without_delays
+from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import factors_of_runs
-from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_poles, beside_poles_at
+from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_poles, beside_poles_at, telling_lines
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.residues import Records
@@ -163,18 +164,19 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     none = Delays.none(test)
     if beside is None or beside.at.misfit < EXACT:  # as no late channel is
         return none
-    still, clocks = _joined(beside.test), _clocks(test)
+    lines, clocks = telling_lines(test), _clocks(test)
+    far = _on_grid(lines, clocks, beside)
+    # What late channels leave at peaks passes for spikes as long as they are late.
+    kept = [np.isin(lines.freq, at.test.freq) for at in [one for _, one in far] or [beside]]
+    still = _joined(lines.at(np.all(kept, axis=0)))
     first = _Late(still, clocks, np.zeros(none.values.size), beside.at.poles)
     complex_ = _Late(still, clocks, first.delays, beside.at.poles, complex_residues=True)
-    if first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
+    if not far and first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
     end = _settled(first)
-    turn = 2 * np.pi * test.freq[-1] * np.abs(end.delays).max()
-    if turn > 1 or complex_.explains_more_than(end):  # perhaps many periods late, of which steps find one alone
-        far, at = _on_grid(beside.test, still, clocks)
-        if at is not None and np.any(far):
-            other = _settled(_Late(still, clocks, far, at.at.poles))
-            end = other if other.explains_more_than(end) else end
+    for delays, at in far:
+        other = _settled(_Late(still, clocks, delays, at.at.poles))
+        end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
     # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
     if complex_.shows_beyond(end) or not end.explains_more_than(complex_):
@@ -349,9 +351,7 @@ def _of_runs(test: Measurement, records: Records) -> Array:
     if test.whole is None:
         return np.zeros((len(records.data), 0))
     weight = factors_of_runs(test.response_std, test.response.shape)[1][records.run, records.line]
-    freq, (times, _) = test.freq[records.line], test.whole.pulses(test.freq[-1])
-    x = freq / test.freq[-1]
-    traces = np.concatenate([[np.ones_like(x), 1j * x, -1j / x], np.exp(2j * np.pi * np.multiply.outer(times, freq))])
+    traces = test.whole.traces(test.freq[records.line], test.freq[-1])
     return stacked(np.concatenate([np.where(records.run == run, weight * traces, 0.0) for run in range(test.n_runs)]))
 
 
@@ -409,34 +409,44 @@ def least_delay(test: Measurement) -> float:
 
 
 def _on_grid(
-    test: Measurement, still: Measurement, clocks: NDArray[np.intp], lines: int = 400, less: float = 0.8
-) -> tuple[Array, BesidePoles | None]:
-    """Delays of many periods, s, (k,), each where real residues leave least, of some lines and on a grid; and poles.
+    test: Measurement, clocks: NDArray[np.intp], beside: BesidePoles, fine: int = 8, less: float = 0.8
+) -> list[tuple[Array, BesidePoles]]:
+    """Delays of many periods, s, (k,), each where real residues leave least on a grid, and poles without them.
 
-    A sensor moves with the base as its row of rigid_body says: with that open, half a period and the other sign of all
-    residues would do as well. Poles are looked for anew once delays are taken off; `less` is left of squares.
+    Once of each channel by itself, and once of all together, as poles that follow the phase of all mislead single
+    ones; none where no delay leaves clearly less, which is `less` of the squares. Poles are those of the accelerations,
+    which a late force does not move, looked for anew once delays are taken off.
     """
-    delays, zero = np.zeros(clocks.max() + 1), 4 * _PERIODS
-    grid = np.arange(-zero, zero + 1) / (4 * test.freq[-1])
-    thin = np.arange(test.freq.size) % -(-test.freq.size // lines) == 0
-    for _ in range(3):
-        beside = beside_poles_at(without_delays(still, delays[clocks]))
-        if beside is None:
-            break
-        left = _left_at(test.at(thin), still.at(thin), clocks, delays + grid[:, None], beside)
-        best = np.argmin(left, axis=0)
-        moved = np.where(left[best, np.arange(delays.size)] < less * left[zero], grid[best], 0.0)
-        if not np.any(moved):
-            break
-        delays = delays + moved
-    return delays, beside
+    count, zero = clocks.max() + 1, fine * _PERIODS
+    grid = np.arange(-zero, zero + 1)[:, None] / (fine * test.freq[-1]) + np.zeros(count)
+    found, first = list[tuple[Array, BesidePoles]](), _left_at(test, clocks, grid, beside)
+    for together in (False, True):
+        delays, at, left = np.zeros(count), beside, first
+        for _ in range(4):
+            if together:
+                left = np.tile(left.mean(axis=1, keepdims=True), count)
+            best = np.argmin(left, axis=0)[None]
+            lower = np.take_along_axis(left, best, axis=0)[0] < left[zero] + np.log(less)
+            step = np.where(lower, np.take_along_axis(grid, best, axis=0)[0], 0.0)
+            anew = beside_poles_at(without_delays(test, delays + step)) if np.any(step) else None
+            if anew is None:
+                break
+            delays, at = delays + step, anew
+            left = _left_at(test, clocks, delays + grid, at)
+        if np.any(delays):
+            found.append((delays, at))
+    return found
 
 
-def _left_at(
-    test: Measurement, still: Measurement, clocks: NDArray[np.intp], delays: Array, beside: BesidePoles
-) -> Array:
-    """Squares that real residues leave of each clock's channels at delays (grid, k), (grid, k)."""
-    carried = np.zeros((clocks.size, test.n_base))
+def _left_at(test: Measurement, clocks: NDArray[np.intp], delays: Array, beside: BesidePoles, most: int = 400) -> Array:
+    """Logarithm of the squares that real residues leave of each clock's channels at delays (grid, k), (grid, k).
+
+    Of so many lines of those that poles were fitted to. A sensor moves with the base as its row of rigid_body says:
+    with that open, half a period and the other sign of all residues would do as well.
+    """
+    lines = np.flatnonzero(np.isin(test.freq, beside.test.freq))
+    test = test.at(np.isin(np.arange(test.freq.size), lines[:: -(-lines.size // most)]))
+    still, carried = _joined(test), np.zeros((clocks.size, test.n_base))
     carried[: test.n_sensors] = test.rigid_body
     records, relative = Records(still), Records(replace(still, rigid_body=carried))
     along = relative.data - records.data  # less what moves with the base
@@ -455,4 +465,4 @@ def _left_at(
             data = np.concatenate([turned.real, turned.imag]) + along[:, some]
             squares = np.sum(data**2, axis=0) - np.sum(basis.answers(data) ** 2, axis=0)
             np.add.at(row, of_clock[some], squares)
-    return found
+    return np.log(np.maximum(found, np.finfo(float).tiny))

@@ -87,12 +87,15 @@ def beside_poles(test: Measurement) -> BesidePoles | None:
 
     Noise counts by its deviations where these are stated; a test of whole records is fitted with its transients.
     """
-    if test.whole is not None:
-        if steady_sine(test) is not None:
-            return None
-        test = test.at(decimated_lines(test))
-        test = replace(test, response_std=rough_deviations(test), force_std=None)
-    return beside_poles_at(test)
+    return None if test.is_whole and steady_sine(test) is not None else beside_poles_at(telling_lines(test))
+
+
+def telling_lines(test: Measurement) -> Measurement:
+    """The lines of a test that tell its poles, with rough deviations where it is one of whole records."""
+    if not test.is_whole:
+        return test
+    test = test.at(decimated_lines(test))
+    return replace(test, response_std=rough_deviations(test), force_std=None)
 
 
 @one_thread()

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
-from sysid.measurement.measurement import Measurement, without_delays
+from sysid.measurement.clocks import without_delays
+from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated

@@ -129,12 +129,14 @@ def linear_modes(p: Parameters, run: int) -> Modes:
 
 
 def add_laws(
-    plain: ComplexArray, laws: Sequence[ModeLaw], additions: Sequence[Addition], d: int, first: Array, *, ends: bool
+    plain: ComplexArray, laws: Sequence[ModeLaw], additions: Sequence[Addition], shape: tuple[int, ...], *, ends: bool
 ) -> list[ComplexArray]:
     """Add what laws add to the spectra of the linear modes, in place; give derivatives by size and law, law by law.
 
-    `first` are the places of motions, of derivatives by gamma, log omega and log zeta, of the base and of the ends.
+    `shape`, (m, d), is that of participations; the spectra are those of `Lines.spectra`.
     """
+    m, d = shape
+    first = np.cumsum([0, m, m * d, m, m, d])  # of motions, by gamma, by log omega, by log zeta; of the base, of ends
     beside = []
     for law, added in zip(laws, additions, strict=True):
         k = law.mode

@@ -431,3 +431,15 @@ def dots(rows: ComplexArray, others: ComplexArray) -> Array:
     one = np.ascontiguousarray(rows).view(float)
     two = one if others is rows else np.ascontiguousarray(others).view(float)
     return np.asarray(one @ two.T)
+
+
+def trace_count(test: Measurement) -> int:
+    """Real numbers of each channel and run beside the response and its transients."""
+    assert test.whole is not None
+    return test.whole.of_sampling + test.whole.pulses(test.freq[-1])[0].size
+
+
+def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:
+    """Pairs of different modes, (k, 2), each once or, with `both`, in both orders."""
+    apart = np.argwhere(~np.eye(m, dtype=bool))
+    return apart if both else apart[apart[:, 0] < apart[:, 1]]

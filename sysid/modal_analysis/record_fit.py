@@ -21,7 +21,7 @@ from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
-from sysid.modal_analysis.modal_model import ModeLaw
+from sysid.modal_analysis.modal_model import ModeLaw, trace_count
 from sysid.modal_analysis.noise_levels import (
     bounded_by_lines,
     floors,
@@ -33,7 +33,6 @@ from sysid.modal_analysis.record_model import (
     NormalEquations,
     Parameters,
     RecordModel,
-    trace_count,
 )
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.varying_levels import extra_numbers

@@ -31,6 +31,8 @@ from sysid.modal_analysis.modal_model import (
     Summed,
     Sums,
     dots,
+    pairs_of,
+    trace_count,
 )
 from sysid.modal_analysis.response import real_times
 from sysid.modal_analysis.varying_levels import segments
@@ -80,12 +82,12 @@ class RecordModel(SpectralModel):
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
         self.by_gains = read_by_gains(test)
-        self.pulses, reached = self.whole.pulses(test.freq[-1])
+        reached = self.whole.pulses(test.freq[-1])[1]
         self._place(static, trace_count(test), gains=gains, coupled=coupled)
-        if self.pulses.size:  # a run that begins and ends at rest has none
+        if reached.size:  # a run that begins and ends at rest has none
             of_channels = np.append(reached, np.repeat(reached[self.n :], self.d - 1, axis=0), axis=0)
             own = of_channels & np.isin(np.arange(test.n_runs), self.whole.moving)[:, None, None]
-            traces = np.concatenate([np.ones((*own.shape[:2], self.whole.traces), bool), own], axis=2)
+            traces = np.concatenate([np.ones((*own.shape[:2], self.whole.of_sampling), bool), own], axis=2)
             self.held[self.kept + self.n_ends : self.coupling.start] = ~traces.ravel()
 
     def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
@@ -95,8 +97,7 @@ class RecordModel(SpectralModel):
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
         self.coupling = slice(before, before + len(self.coupled))
-        numbers = sum(law.form.size for law in self.laws)
-        self.of_laws = slice(self.coupling.stop, self.coupling.stop + numbers)
+        self.of_laws = slice(self.coupling.stop, self.coupling.stop + sum(law.form.size for law in self.laws))
         self.of_gains = slice(self.of_laws.stop, self.of_laws.stop + self.by_gains.shape[2])
         self.n_fit = self.of_gains.stop
         self.gains = gains
@@ -114,10 +115,8 @@ class RecordModel(SpectralModel):
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """Spectra of which the traces of a channel are multiples, (traces, L): last those of turned records' ends."""
-        unit = freq / self.test.freq[-1]
-        plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])[: self.whole.traces]
-        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses[:, None] * freq)])
+        """See `SpectralModel`."""
+        return self.whole.traces(freq, self.test.freq[-1])
 
     def at_signal(self, p: Parameters) -> RecordModel:
         """The same, shares of the signal in the noise being those of what these parameters predict."""
@@ -173,11 +172,10 @@ class RecordModel(SpectralModel):
             coupling = np.zeros((self.m, self.m))
             coupling[*self.coupled.T] = x[self.coupling]
             coupling = coupling + coupling.T if self.force else coupling
-        cuts = np.cumsum([law.form.size for law in self.laws])[:-1]
-        numbers = np.split(x[self.of_laws], cuts)
+        numbers = np.split(x[self.of_laws], np.cumsum([law.form.size for law in self.laws])[:-1])
         laws = tuple(law._replace(values=values) for law, values in zip(self.laws, numbers, strict=False))
-        traces = traces.reshape(shape)
-        return Parameters(modes, rigid, ends.reshape(self.m, -1), traces, coupling, x[self.of_gains], laws)
+        ends, traces = ends.reshape(self.m, -1), traces.reshape(shape)
+        return Parameters(modes, rigid, ends, traces, coupling, x[self.of_gains], laws)
 
     def moved(self, x: Array, step: Array, most: float = 1.0) -> Array:
         """Unknowns after a step, to first order their sum: a mode's scale, shape against load, changes by a factor.
@@ -392,8 +390,7 @@ class LawChunk(Chunk):
     @cached_property
     def added(self) -> list[Addition]:
         """What each law adds."""
-        motions = self.records.law_motions
-        assert motions is not None
+        assert (motions := self.records.law_motions) is not None
         return [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
@@ -407,8 +404,9 @@ class LawChunk(Chunk):
         """See `Chunk`; last, law by law, come derivatives by the logarithm of the size of the shape, and by the law."""
         plain, m, d = super().spectra(base), self.records.m, self.records.d
         first = np.cumsum([0, m, m * d, m, m, d])  # of q, by gamma, by log omega, by log zeta, u; then ends
-        last = add_laws(plain, self.p.laws, self.added, d, first, ends=self.at_ends is not None)
-        return np.concatenate([plain, *last])
+        return np.concatenate(
+            [plain, *add_laws(plain, self.p.laws, self.added, d, first, ends=self.at_ends is not None)]
+        )
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """See `Chunk`."""
@@ -502,15 +500,3 @@ class SummedChunk(Chunk):
         """Add columns that all channels feel to rows of the unknowns `at`; `felt` (m, L) is what loads of modes do."""
         for unknowns, acting, loads in moves:
             out[np.searchsorted(at, unknowns)] += felt[acting] * loads
-
-
-def trace_count(test: Measurement) -> int:
-    """Real numbers of each channel and run beside the response and its transients."""
-    assert test.whole is not None
-    return test.whole.traces + test.whole.pulses(test.freq[-1])[0].size
-
-
-def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:
-    """Pairs of different modes, (k, 2), each once or, with `both`, in both orders."""
-    apart = np.argwhere(~np.eye(m, dtype=bool))
-    return apart if both else apart[apart[:, 0] < apart[:, 1]]

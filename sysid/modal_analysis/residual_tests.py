@@ -191,7 +191,7 @@ def scatter(fit: RecordFit) -> Array | None:
     With A, the information of the fit, the covariance of the modes is ``A^-1 B A^-1 / 2``; for white noise B is A.
     """
     # Levels stated too low or too high are no reason: the power of the misfit counts once, with the information.
-    return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
+    return scatter_over_blocks(fit) if _missed(fit) else None
 
 
 def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
@@ -297,23 +297,24 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     better known of both is taken. Motion with the base in any of its directions is asked for beside that part.
 
     Poles above the lines stand for more modes than there are of them: the part that these leave is asked for then, as
-    where both agree by chance the first would pass for exact.
+    where both agree by chance the first would pass for exact. What the model misses beyond both counts as well.
     """
     asked, G = _asked_of_gains(fit), fit.test.rigid_body
     equations, (n, d) = fit.equations.at(asked), G.shape
     at = asked.size - 3 * n * d  # what is asked for comes behind all that was fitted
-    beyond = max(fit.reduced, 1.0) * (_MISSED**2 if fit.model.whole.plain else 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(2 * n * d))
     normal, size = unit_diagonal(along.T @ equations.normal @ along)
     gradient = along.T @ equations.gradient / size
 
     def estimate(count: int) -> tuple[Array, Array]:
         half = half_inverse(normal[:count, :count], ROUND_OFF)
-        step = half @ (half.T @ gradient[:count])
-        std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
-        return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
+        return half @ (half.T @ gradient[:count]) / size[:count], np.linalg.norm(half[at : at + n], axis=1)
 
-    (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
+    (step, plain_std), (both, std) = estimate(at + n), estimate(size.size)
+    plain, error = step[at:], both[at : at + n]
+    missed = fit.model.whole.plain or (_missed(fit) and _missed(_with_gains(fit, asked[:at], step)))
+    beyond = max(fit.reduced, 1.0) * (_MISSED**2 if missed else 1.0)
+    plain_std, std = (np.sqrt(beyond / 2) * one / size[at : at + n] for one in (plain_std, std))
     plain_std = np.hypot(plain_std, plain - error)
     better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
     rigid, chi2 = _rigid(fit, beyond)
@@ -325,6 +326,21 @@ def gain_errors_of(fit: RecordFit) -> Gains:
         np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom,
         _moves_by_gains(fit, half, of_constants), rigid, chi2,
     )  # fmt: skip
+
+
+def _missed(fit: RecordFit) -> bool:
+    """True where what is left is no white noise: the model misses something, which gains and delays make up for."""
+    return uneven(fit, 2 * fit.chi2 / fit.model.numbers)
+
+
+def _with_gains(fit: RecordFit, asked: NDArray[np.intp], step: Array) -> RecordFit:
+    """The fit after a step of its unknowns `asked` and then of all gains, which leaves to a model what it misses."""
+    x, test = np.zeros(fit.model.size), fit.test
+    x[asked], errors = np.split(step, [asked.size])
+    p = fit.model.unpack(fit.model.moved(fit.model.pack(fit.parameters), x))
+    right = replace(test, response=test.response - errors[:, None] * (test.rigid_body @ test.base))
+    trial = replace(fit, test=right, parameters=p)
+    return replace(trial, chi2=trial.model.gradient(p, fit.levels).chi2)
 
 
 def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:
@@ -448,5 +464,5 @@ def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
     normal, size = unit_diagonal(turn.T @ fit.equations.normal @ turn)
     half = half_inverse(normal, ROUND_OFF)
     step, rows = half @ (half.T @ (turn.T @ fit.equations.gradient / size)), half[at:] / size[at:, None]
-    missed = _MISSED**2 if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else 1.0
+    missed = _MISSED**2 if _missed(fit) else 1.0
     return step[at:] / size[at:], missed * max(fit.reduced, 1.0) / 2 * rows @ rows.T

@@ -17,9 +17,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import TimeRun
 from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.modal_model import Parameters
+from sysid.modal_analysis.modal_model import Parameters, trace_count
 from sysid.modal_analysis.record_fit import Limits, RecordFit, fit_model, record_modes
-from sysid.modal_analysis.record_model import RecordModel, trace_count
+from sysid.modal_analysis.record_model import RecordModel
 from sysid.structure.structure import Array
 
 _PERIODS = 25  # of the lowest mode, that a stretch holds at least

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
-from sysid.measurement.measurement import Measurement, without_delays
+from sysid.measurement.clocks import without_delays
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
 from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests, follow_amplitude

@@ -12,7 +12,8 @@ from sysid.assessment.assumptions import assumptions
 from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.finding import Finding
-from sysid.measurement.measurement import Measurement, without_delays
+from sysid.measurement.clocks import without_delays
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Delays, stored_delays
 from sysid.modal_analysis.record_fit import RecordFit

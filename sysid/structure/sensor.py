@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,17 @@ from sysid.errors import InputError, as_float, finite_array, instance, refuse, s
 
 Array = NDArray[np.floating[Any]]
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class BaseSensor(NamedTuple):
+    """A sensor of the base among more than its directions need: how it reads the motion that is taken for the base's.
+
+    `gain` times that motion, and by the share `off` of its record beside it.
+    """
+
+    name: str
+    gain: float
+    off: float
 
 
 def unit_vector(value: ArrayLike, label: str) -> Array:

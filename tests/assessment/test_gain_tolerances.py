@@ -10,8 +10,8 @@ from sysid import Problem, Sensor, Structure, simulate
 from sysid.assessment.checks.gains import GainErrors
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.jobs.changes import drawn_from
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
-from sysid.measurement.measurement import without_delays
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.record_model import RecordModel

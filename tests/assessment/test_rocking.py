@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import Problem, Sensor
-from sysid.measurement.measurement import BaseSensor
+from sysid.structure.sensor import BaseSensor
 
 HEIGHTS = np.array([0.6, 1.1, 1.9, 2.4])
 MASS = np.array([4.0, 3.0, 5.0, 2.0])

@@ -3,8 +3,21 @@
 import subprocess
 import sys
 
-LEAVES_A_POOL = """
+import pytest
+
+LEFT = """
+    pool.submit(abs, -1).result()
+    Finalize(pool, lambda: print(pool.over, flush=True), exitpriority=15)  # just before queues end
+"""
+DROPPED = """
+    pool.submit(time.sleep, 2)
+    thread = pool._executor_manager_thread
+    del make, pool
+    Finalize(None, lambda: print(not thread.is_alive(), flush=True), exitpriority=15)
+"""
+SCRIPT = """
 import multiprocessing
+import time
 from multiprocessing.util import Finalize
 
 from sysid.jobs import processes
@@ -13,9 +26,7 @@ from sysid.jobs import processes
 def leave():
     make = processes(1)
     pool = make()
-    pool.submit(abs, -1).result()
-    Finalize(pool, lambda: print(pool.over, flush=True), exitpriority=15)  # just before queues end
-
+    {leaves}
 
 if __name__ == "__main__":
     process = multiprocessing.get_context("spawn").Process(target=leave)
@@ -26,9 +37,10 @@ if __name__ == "__main__":
 """
 
 
-def test_a_process_may_end_with_a_pool_left_open(tmp_path):
+@pytest.mark.parametrize("leaves", [LEFT, DROPPED])
+def test_a_process_may_end_with_a_pool_left_open_or_dropped(tmp_path, leaves):
     """It is shut down before queues end: else its workers would wait for ever, now and then."""
     script = tmp_path / "script.py"
-    script.write_text(LEAVES_A_POOL)
+    script.write_text(SCRIPT.format(leaves=leaves.strip()))
     run = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=True)
     assert run.stdout.split() == ["True", "0"], run.stderr

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from benchmarks.records.simulated import Records, Run, four_storeys
-from sysid.measurement.measurement import without_delays
+from sysid.measurement.clocks import without_delays
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles
 from sysid.modal_analysis.fit import whole_fit
@@ -53,7 +53,7 @@ def record(delays, seed=0):
 
 LATE = [
     [0, 2 * MS, 0, 0, 0], [0.5 * MS] * 5, [0, 0, 0, 0, -3 * MS], [0, 50 * MS, -50 * MS, 0, 30 * MS],
-    [0, 0, 0, 0, 140 * MS],
+    [0, 0, 0, 0, 140 * MS], [0, 0, 0, 0, -900 * MS], [0, -430 * MS, 0, 0, 0], [-440 * MS] * 5,
 ]  # fmt: skip
 
 

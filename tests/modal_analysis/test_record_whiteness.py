@@ -9,7 +9,7 @@ import sysid
 from benchmarks.records.simulated import Records, four_storeys
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.record_fit import record_modes, refitted
-from sysid.modal_analysis.residual_tests import most_unlikely, unidentifiable_levels
+from sysid.modal_analysis.residual_tests import gain_errors_of, most_unlikely, unidentifiable_levels
 from sysid.structure.thresholds import FALSE_ALARM
 
 SETTING = four_storeys()
@@ -75,3 +75,19 @@ def test_levels_that_the_records_leave_open_are_told_only_where_there_is_noise(n
     )  # fmt: skip
     fit = record_modes(test, np.array([wk]), np.array([ratio]))
     assert bool(unidentifiable_levels(refitted(fit, fit.parameters))) == told
+
+
+@pytest.mark.parametrize(("gain", "modes"), [(1.0, 3), (1.02, 4)])
+def test_a_model_that_misses_a_mode_names_no_gain_and_a_wrong_gain_is_no_missing_mode(gain: float, modes: int) -> None:
+    """Four modes, of which three or all are fitted; what the fourth leaves made gains 4 deviations wrong."""
+    records, structure = made(0, 30.0), SETTING.structure
+    response = records.response * np.array([1, gain, 1, 1])[:, None]
+    test = sysid.Measurement.from_time(
+        [(records.base, response, records.force)], SETTING.sample_rate, rigid_body=np.ones((4, 1)), band=SETTING.lines
+    )
+    fit = record_modes(test, 2 * np.pi * structure.natural_frequencies[:modes], structure.damping_ratios[:modes])
+    found = gain_errors_of(refitted(fit, fit.parameters))
+    off = np.abs(found.error / found.std)
+    assert np.all(np.delete(off, 1) < 2)
+    assert off[1] > 10 if gain != 1 else off[1] < 2
+    assert gain == 1 or found.error[1] == pytest.approx(gain - 1, abs=3 * found.std[1])
