@@ -255,7 +255,7 @@ def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> NDArray[np.f
     return array
 
 
-def symmetric(name: str, value: ArrayLike, size: int | str, tolerance: float) -> NDArray[np.floating[Any]]:
+def symmetric_array(name: str, value: ArrayLike, size: int | str, tolerance: float) -> NDArray[np.floating[Any]]:
     """A symmetric array of this shape; refused where it is none."""
     array = shaped_array(name, value, size, size)
     scale = np.sqrt(np.abs(np.diag(array)))

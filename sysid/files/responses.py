@@ -111,8 +111,8 @@ def _deviations(
     unused += [f"that of {lacking!r} is missing"] * (lacking is not None)
     unused += ["state of how many independent segments they are: averages = 40 (--averages)"] * (not said.averages)
     if unused:
-        told = any(one.coherence is not None for one in every)
-        return none, [f"coherences stand in the files and are not used: {unused[0]}"] * told
+        given = any(one.coherence is not None for one in every)
+        return none, [f"coherences stand in the files and are not used: {unused[0]}"] * given
     hann = said.window == "hann"
     response, force = [], []
     for run in parts:

@@ -278,7 +278,7 @@ def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.rando
 def _whole_again(modal: ModalEstimate, structure: Structure, rng: np.random.Generator) -> Measurement:
     """Whole records that the structure makes with the same transients, and noise of the same levels in all channels."""
     test, at_rest, (n, d) = modal.given, modal.records, structure.rigid_body.shape
-    of_sensors, of_force, of_base = np.split(modal.own_deviations, [n, -d], axis=1)
+    of_sensors, of_force, of_base = np.split(modal.channel_deviations, [n, -d], axis=1)
 
     def drawn(record: ComplexArray, std: Array) -> ComplexArray:
         return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)

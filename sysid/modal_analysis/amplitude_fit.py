@@ -55,10 +55,10 @@ def _with_laws(
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
     monitor.keep_instead(linear)
-    own = _modes_of(linear, stated)
+    numbers = _modes_of(linear, stated)
     first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
     monitor.doing = "a law of amplitude"
-    best = _begun(linear, own, first, tries, monitor)
+    best = _started(linear, numbers, first, tries, monitor)
     monitor.keep_instead(best)
     if stated.exponents == "auto":
         best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
@@ -85,20 +85,20 @@ def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
     return [int(order[mode - 1]) for mode in stated.modes]
 
 
-def _begun(
-    linear: RecordFit, own: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
+def _started(
+    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
 ) -> RecordFit:
     """Laws of these exponents, from the better of some falls of the frequency."""
     p = linear.parameters
     found = []
     for fall in tries:
         laws = []
-        for k in own:
+        for k in numbers:
             sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
             form = LawForm(*exponents, _levels(linear, k, sensor)[1])
             laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0]), np.ones((linear.test.n_runs, 2))))
         modes = p.modes._replace(
-            omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), own), 1 + fall / 2, 1)
+            omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), numbers), 1 + fall / 2, 1)
         )
         found.append(refitted(linear, replace(p, modes=modes, laws=tuple(laws)), limits=ROUGH, monitor=monitor))
     best = max(found, key=lambda one: one.likelihood)

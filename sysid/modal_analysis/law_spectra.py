@@ -59,10 +59,8 @@ class LawMotions:
     def __init__(self, test: Measurement, per_period: float = 24.0) -> None:
         self.per_period = per_period
         self.rate, self.samples, self.at_rest = _clock_of(test)
-        self.lines, self.base = [], []
-        for base, own in zip(test.base, test.own_lines, strict=True):
-            self.lines.append(test.freq[own])
-            self.base.append(base[:, own])
+        self.lines = [test.freq[lines] for lines in test.own_lines]
+        self.base = [base[:, lines] for base, lines in zip(test.base, test.own_lines, strict=True)]
         self._series: dict[tuple[int, int], tuple[int, Array]] = {}
         self._last: tuple[Parameters | None, dict[tuple[int, int], Addition]] = (None, {})
 
@@ -195,11 +193,11 @@ def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray
     motions = LawMotions(test)
     ends = np.zeros((structure.n, 2 * sum(not rest for rest in motions.at_rest)))
     p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)
-    for run, own in enumerate(test.own_lines):
+    for run, lines in enumerate(test.own_lines):
         for number, law in enumerate(laws):
             added = motions.of_run(p, run, number).motion
-            response[run][:, own] += modes.phi[:, [law.mode]] * added
-            force[run][:, own] += modes.gamma[law.mode][:, None] * added
+            response[run][:, lines] += modes.phi[:, [law.mode]] * added
+            force[run][:, lines] += modes.gamma[law.mode][:, None] * added
     return response, force
 
 

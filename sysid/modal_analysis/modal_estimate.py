@@ -222,7 +222,7 @@ class ModalEstimate:
         return None if self.record_fit is None else self.record_fit.shares
 
     @property
-    def own_deviations(self) -> Array:
+    def channel_deviations(self) -> Array:
         """Standard deviations of each channel's own noise at the lines, (runs, c + d, n_freq or 1)."""
         assert self.noise is not None
         fit = self.record_fit

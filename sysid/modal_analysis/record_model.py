@@ -390,8 +390,8 @@ class LawChunk(Chunk):
     @cached_property
     def added(self) -> list[Addition]:
         """What each law adds."""
-        assert (motions := self.records.law_motions) is not None
-        return [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
+        motions = self.records.law_motions
+        return [] if motions is None else [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
         """See `Lines`."""
@@ -402,11 +402,8 @@ class LawChunk(Chunk):
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """See `Chunk`; last, law by law, come derivatives by the logarithm of the size of the shape, and by the law."""
-        plain, m, d = super().spectra(base), self.records.m, self.records.d
-        first = np.cumsum([0, m, m * d, m, m, d])  # of q, by gamma, by log omega, by log zeta, u; then ends
-        return np.concatenate(
-            [plain, *add_laws(plain, self.p.laws, self.added, d, first, ends=self.at_ends is not None)]
-        )
+        plain, ends = super().spectra(base), self.at_ends is not None
+        return np.concatenate([plain, *add_laws(plain, self.p.laws, self.added, self.p.modes.gamma.shape, ends=ends)])
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """See `Chunk`."""

@@ -136,10 +136,10 @@ class FittedLaw:
     @property
     def is_certain(self) -> bool:
         """True where chance does not make such a law."""
-        own = self.covariance[2:, 2:]
-        size = np.sqrt(np.maximum(np.diag(own), np.finfo(float).tiny))
+        covariance = self.covariance[2:, 2:]
+        size = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         unit = self.values / size
-        away = float(unit @ np.linalg.pinv(own / np.outer(size, size), hermitian=True) @ unit)
+        away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
         return away > beyond_chance(self.values.size)
 
     def at(self, level: float) -> tuple[float, float]:
@@ -228,8 +228,8 @@ def _recursion(form: LawForm, steps: int, directions: int) -> ca.Function:
         return step.mapaccum("motion", steps)
     count = 2 + directions + p.numel()
     moves, motions = ca.SX.sym("S", 3, count), ca.SX.sym("U", 2, directions)
-    own = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
-    moved = ca.jacobian(after, state) @ moves + own
+    direct = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
+    moved = ca.jacobian(after, state) @ moves + direct
     by = ca.jacobian(restoring, state) @ moves
     by += ca.horzcat(ca.SX.zeros(1, 2 + directions), ca.jacobian(restoring, p))
     outputs = [ca.horzcat(after, moved), ca.horzcat(restoring, by)]

@@ -10,11 +10,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, symmetric, whole_number
+from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, symmetric_array, whole_number
 from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
-from sysid.structure.superelement import CraigBampton, ResidualModes, check_matrices, modal_gains
+from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -121,8 +121,8 @@ class Structure:
         laws: Sequence[FittedLaw] = (),
     ) -> None:
         self.laws = tuple(laws)
-        self.mass = symmetric("mass", mass, "n + d", EXACT)
-        self.stiffness = symmetric("stiffness", stiffness, "n + d", EXACT)
+        self.mass = symmetric_array("mass", mass, "n + d", EXACT)
+        self.stiffness = symmetric_array("stiffness", stiffness, "n + d", EXACT)
         if self.mass.shape != self.stiffness.shape:
             raise InputError(f"mass is {self.mass.shape} but stiffness is {self.stiffness.shape}; both are (n+d, n+d)")
         size = len(self.mass)
@@ -132,7 +132,7 @@ class Structure:
             raise InputError(
                 f"n_base = {n_base} leaves {n} structural degrees of freedom of {size}; at least one of each is needed"
             )
-        self.rigid_body_dofs: Array = check_matrices(self.mass, self.stiffness, n)
+        self.rigid_body_dofs: Array = checked_rigid_motion(self.mass, self.stiffness, n)
 
         lam, phi = scipy.linalg.eigh(self.stiffness[:n, :n], self.mass[:n, :n])
         self._omega = np.sqrt(lam)
@@ -463,7 +463,7 @@ class Structure:
             self.damping: Array = momentum @ modal @ momentum.T
         else:
             assert matrix is not None
-            self.damping = symmetric("damping_matrix", matrix, n, EXACT)
+            self.damping = symmetric_array("damping_matrix", matrix, n, EXACT)
             modal = self.normal_modes.T @ self.damping @ self.normal_modes
             if np.linalg.eigvalsh(modal)[0] < -EXACT * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")

@@ -125,7 +125,7 @@ class CraigBampton:
     recovery: Array
 
 
-def check_matrices(mass: Array, stiffness: Array, n: int) -> Array:
+def checked_rigid_motion(mass: Array, stiffness: Array, n: int) -> Array:
     """Check mass and stiffness of a structure of n degrees of freedom; give G of these, (n, d)."""
     for name, matrix in (("mass", mass), ("stiffness", stiffness)):
         check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])

@@ -150,7 +150,7 @@ def test_noise_is_drawn_anew_with_the_shares_that_were_found() -> None:
     modal = fit_modes(spoiled("two levels", 1)[1])
     test = modal.given
     every = np.abs(np.concatenate([test.response, test.force, test.base], axis=1))
-    np.testing.assert_allclose(np.median(modal.own_deviations / every, axis=2), 0.004, rtol=0.5)
+    np.testing.assert_allclose(np.median(modal.channel_deviations / every, axis=2), 0.004, rtol=0.5)
 
 
 def test_errors_that_neighbouring_lines_share_widen_the_covariance_of_plain_spectra_and_white_ones_do_not() -> None:

@@ -60,10 +60,10 @@ def rocking_tables(context: Context) -> Iterator[Finding]:
     """The table turns as it moves along an axis: what sensors move by beside their modes rises with their places."""
     if not (context.is_explained or context.named or context.has("changing")):
         suspected = any(miss.times > BEYOND for miss in context.misses)
-        yield from of_tests([list(_told(modal, its, suspected)) for _, modal, its in context.fits])
+        yield from of_tests([list(_findings(modal, its, suspected)) for _, modal, its in context.fits])
 
 
-def _told(modal: ModalEstimate, structure: Structure, suspected: bool) -> Iterator[Finding]:
+def _findings(modal: ModalEstimate, structure: Structure, suspected: bool) -> Iterator[Finding]:
     test = modal.records
     for one in _found(modal, structure, suspected):
         along, slope = test.base_axes[one.axis], f"{one.slope:.2g}"
