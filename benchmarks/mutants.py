@@ -122,7 +122,7 @@ MISSED = (
         "if self.state is EvolutionaryState.CONVERGENCE and self.box.n_free > 0:", "if self.box.n_free > 0:",
         "test_moves"),
     Mutant("H03", "deviations of free matrices never inflated",
-        "inflation = inflation_of(test, records, unknowns, modal.scattered)", "inflation = 1.0",
+        "inflation = inflation_of(test, records, unknowns, scattered)", "inflation = 1.0",
         "test_uncertainty::TestNoiseLevel"),
 )  # fmt: skip
 

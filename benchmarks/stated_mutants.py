@@ -26,7 +26,7 @@ MISSED = (
         "return 2 * self.chi2 / self.freedom", "return self.chi2 / self.freedom",
         "test_record_model::test_chi_squared_of_right_modes_and_levels_is_its_degrees_of_freedom"),
     Mutant("J03b", "likelihood of whole records without the density of their spectra",
-        "np.sum(np.log(variances[:c] * chunk.run.density))", "np.sum(np.log(variances[:c]))",
+        "np.sum(np.log(variances[:c]))", "np.sum(np.log(variances[:c] / chunk.run.density))",
         "test_record_model::test_the_likelihood_is_that_of_the_dense_covariance"),
     Mutant("J04", "scales of the modes counted among what whole records without a force determine",
         "- (0 if self.force else self.m) - turns", "- turns",

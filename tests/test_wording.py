@@ -335,8 +335,8 @@ COMMANDS = {
     "run --resume out": "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there, and goes on with "
     "it where there is one",
     "run idle.py --resume out --fresh": "--resume and --fresh exclude each other",
-    "run shear_building --goal 0.1": "--mass, --lumped, --band, --gain-std, --at-rest and --goal are for a "
-    "test that 'sysid read' wrote",
+    "run shear_building --goal 0.1": "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for "
+    "a test that 'sysid read' wrote",
     "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
 }
 

@@ -170,7 +170,8 @@ def _of_run(parts: list[ErrorSpectra], D: dict[int, Array], levels: Array, bound
     value, score, fisher = _likelihood(parts, D, x)
     grows = parts[0].run.signal is not None
     for _ in range(30):
-        free = np.where(score > 0, x < highest, x > lowest)  # others would turn the step of those that they go with
+        # Where a channel's noise has two parts, those on a bound would turn the step of the others.
+        free = np.where(score > 0, x < highest, x > lowest) | (not grows)
         size, step = np.sqrt(np.maximum(np.diag(fisher)[free], np.finfo(float).tiny)), np.zeros(x.size)
         # Of two parts of one channel's noise the smaller may hardly show.
         scaled = fisher[np.ix_(free, free)] / np.outer(size, size) + np.diag(1e-6 + 0.1 * grows / size**2)

@@ -278,7 +278,7 @@ def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None =
     test = replace(test, whole=replace(test.whole, varying=was.varying, plain=was.plain))
     p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
     traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
-    traces[..., : was.traces] = p.traces[..., : was.traces]
+    traces[..., : was.of_sampling] = p.traces[..., : was.of_sampling]
     return refitted(replace(fit, test=test), replace(p, traces=traces, gains=np.zeros(0)), monitor=monitor)
 
 

@@ -103,7 +103,7 @@ def _power(unit: ca.SX, exponent: float) -> ca.SX:
     """A power of a level that is finite, and smooth, at rest."""
     if exponent == 2:
         return unit**2
-    return (unit**2 + (1e-12 if exponent > 0 else 1e-6)) ** (exponent / 2)
+    return (unit**2 + (1e-12 if exponent > 0 else 1e-4)) ** (exponent / 2)
 
 
 @dataclass(frozen=True, eq=False)

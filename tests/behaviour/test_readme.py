@@ -89,7 +89,7 @@ def _write_log(table, rate, described, pyuff):
 
 def test_the_examples_of_the_docs_find_their_own_structure(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (first,), (second, complex_terms, third) = map(examples, ("docs/notebooks.md", "docs/own_unknowns.md"))
+    (first,), (second, complex_terms, _, third) = map(examples, ("docs/notebooks.md", "docs/own_unknowns.md"))
     names = {}
     with contextlib.redirect_stdout(io.StringIO()) as said:
         exec(compile(first, "notebooks.md", "exec"), names)

@@ -102,7 +102,7 @@ def test_the_gradient_of_the_fit_is_that_of_differences(test, form, at_rest):
         def chi2(times, step=step):
             return model.chi2(model.unpack(x + times * step), fit.levels)
 
-        difference = (8 * (chi2(0.1) - chi2(-0.1)) - (chi2(0.2) - chi2(-0.2))) / 1.2
+        difference = (8 * (chi2(0.03) - chi2(-0.03)) - (chi2(0.06) - chi2(-0.06))) / 0.36
         assert difference == pytest.approx(-2 * exact.gradient @ step, rel=1e-6)
 
 
