@@ -235,6 +235,11 @@ class Measurement:
         return np.concatenate([self.base, ends], axis=1)
 
     @property
+    def is_in_time(self) -> bool:
+        """True where its lines are those of records in time: of whole ones, or of runs from rest to rest."""
+        return self.is_whole or (self.sample_rate is not None and not self.averaged)
+
+    @property
     def is_whole(self) -> bool:
         """True where it is of whole records, which hold their transients."""
         return self.whole is not None

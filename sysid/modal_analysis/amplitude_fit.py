@@ -17,7 +17,7 @@ from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refi
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import EPSILON, ROUND_OFF
+from sysid.structure.thresholds import EPSILON, ROUND_OFF, beyond_chance
 
 
 def with_laws(
@@ -37,10 +37,10 @@ def with_laws(
     """
     try:
         with monitor.at_work():
+            monitor.keep_instead(fit)
             return _with_laws(fit, stated, left_of, monitor, much, tries)
     except (Stop, KeyboardInterrupt):
-        best = monitor.best
-        return replace(best if isinstance(best, RecordFit) else fit, stopped=True)
+        return replace(fit, stopped=True)
 
 
 def _with_laws(
@@ -48,28 +48,57 @@ def _with_laws(
     tries: tuple[float, ...],
 ) -> RecordFit:  # fmt: skip
     p, whole = fit.parameters, fit.model.whole
+    if p.coupling is not None:
+        raise InputError(
+            "AmplitudeLaw: the records show modes that dampers couple, and a mode that follows its amplitude stands "
+            "alone here: leave amplitude out"
+        )
     plain = left_of(fit) > much or whole.plain
     whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
-    linear = replace(fit, test=replace(fit.test, whole=whole), parameters=replace(p, coupling=None))
-    if plain or p.coupling is not None:
+    linear = replace(fit, test=replace(fit.test, whole=whole))
+    if plain:
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
-    monitor.keep_instead(linear)
     numbers = _modes_of(linear, stated)
     first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
     monitor.doing = "a law of amplitude"
     best = _started(linear, numbers, first, tries, monitor)
-    monitor.keep_instead(best)
     if stated.exponents == "auto":
         best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
         best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
     if plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
-        p, whole = _with_equivalents(best), replace(whole, plain=False)
-        best = replace(best, test=replace(best.test, whole=whole))
-        best = refitted(replace(best, levels=rough_levels(best.model_of(p), p)), p, monitor=monitor)
-        monitor.keep_instead(best)
-    return best
+        noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
+        best, linear = (
+            refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
+            for p in (_with_equivalents(best), linear.parameters)
+        )
+    return _judged(best, linear)
+
+
+def _judged(best: RecordFit, linear: RecordFit) -> RecordFit:
+    """The fit, whose laws are told to be likelier than the linear fit of the same records, or not, beyond chance.
+
+    Squares take the base as exact, and what its noise does at a few lines near a peak passes for what a law does: there
+    the gain must also be beyond its scatter from line to line (Vuong, Econometrica 57 (1989) 307-333).
+    """
+    numbers = sum(law.form.size for law in best.parameters.laws)
+    gained = 2 * (best.likelihood - linear.likelihood) / _shared(best)
+    likelier = gained > beyond_chance(numbers, len(OF_FREQUENCY) + len(OF_DAMPING))
+    if likelier and best.model.whole.plain:
+        each = _of_lines(best) - _of_lines(linear)
+        likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
+    laws = tuple(law._replace(likelier=likelier) for law in best.parameters.laws)
+    return replace(best, parameters=replace(best.parameters, laws=laws))
+
+
+def _of_lines(fit: RecordFit) -> Array:
+    """Twice the logarithm of the likelihood of each line of squares, (lines,)."""
+    found = []
+    for chunk in fit.model.chunks(fit.parameters):
+        spread = np.sum(np.log(chunk.run.variances(fit.levels)[: fit.model.channels]), axis=0)
+        found.append(-2 * (chunk.weighed(fit.levels).power + spread))
+    return np.concatenate(found)
 
 
 def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
@@ -97,10 +126,12 @@ def _started(
             sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
             form = LawForm(*exponents, _levels(linear, k, sensor)[1])
             laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0]), np.ones((linear.test.n_runs, 2))))
-        modes = p.modes._replace(
-            omega=p.modes.omega * np.where(np.isin(np.arange(linear.model.m), numbers), 1 + fall / 2, 1)
+        followed = np.isin(np.arange(linear.model.m), numbers)
+        modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + fall / 2, 1.0))
+        ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
+        found.append(
+            refitted(linear, replace(p, modes=modes, ends=ends, laws=tuple(laws)), limits=ROUGH, monitor=monitor)
         )
-        found.append(refitted(linear, replace(p, modes=modes, laws=tuple(laws)), limits=ROUGH, monitor=monitor))
     best = max(found, key=lambda one: one.likelihood)
     return refitted(best, _with_equivalents(best), monitor=monitor)
 
@@ -116,8 +147,12 @@ def _likeliest(
         found = refitted(best, replace(p, laws=laws), monitor=monitor)
         if found.likelihood > best.likelihood:
             best = found
-            monitor.keep_instead(best)
     return best
+
+
+def _shared(fit: RecordFit) -> float:
+    """Factor of variances for what a fit leaves beyond its noise, and what neighbouring lines of it share."""
+    return max(fit.reduced, 1.0) * line_correlation(_white_errors(fit), fit.model.unknowns)
 
 
 def _white_errors(fit: RecordFit) -> ComplexArray:
@@ -176,8 +211,7 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         return ()
     N, size = unit_diagonal(fit.normal[: model.n_fit, : model.n_fit])
     half = half_inverse(N, ROUND_OFF)
-    widened = max(fit.reduced, 1.0) * line_correlation(_white_errors(fit), model.unknowns)
-    covariance = half @ half.T / np.outer(size, size) / 2 * widened
+    covariance = half @ half.T / np.outer(size, size) / 2 * _shared(fit)
     first = model.of_laws.start
     for law in p.laws:
         at = [
@@ -190,7 +224,7 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         found.append(
             FittedLaw(
                 omega / (2 * np.pi), ratio, law.sensor, law.form, law.values, _levels(fit, law.mode, law.sensor),
-                covariance[np.ix_(at, at)],
+                covariance[np.ix_(at, at)], law.likelier,
             )
         )  # fmt: skip
     return tuple(found)

@@ -404,8 +404,10 @@ def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMo
     return tuple(found)
 
 
-def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw, monitor: FitMonitor) -> ModalEstimate:
+def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw | None, monitor: FitMonitor) -> ModalEstimate:
     """The estimate of whole records with laws of the stated modes, which are its modes' where one of them is certain.
+
+    Itself where none are asked for.
 
     Raises
     ------
@@ -413,11 +415,13 @@ def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw, monitor: FitMon
         Where there is no such mode.
     """
     fit = modal.record_fit
-    assert fit is not None
+    if stated is None or fit is None:
+        return modal
+    monitor.begin(1)
     with one_thread():
         found = with_laws(fit, stated, left_of, monitor=monitor)
         laws = fitted_laws(found)
-        if found.stopped or any(law.is_certain for law in laws):
+        if any(law.is_certain for law in laws) or found.stopped:
             return estimate(found, modal.calibration)
     return replace(modal, laws=laws)
 

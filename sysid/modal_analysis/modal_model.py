@@ -161,7 +161,7 @@ class ModeLaw(NamedTuple):
     """A mode that follows its amplitude at a sensor, both by number, the form of its law and the law's numbers.
 
     `equivalent`, (runs, 2), is by what frequency and damping ratio are multiplied for the linear mode that noise of the
-    base moves in each run.
+    base moves in each run. `likelier` tells that the laws of a fit are likelier than none beyond chance.
     """
 
     mode: int
@@ -169,6 +169,7 @@ class ModeLaw(NamedTuple):
     form: LawForm
     values: Array
     equivalent: Array
+    likelier: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -208,7 +208,14 @@ class RecordFit:
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
         laws = tuple(
-            ModeLaw(law["mode"], law["sensor"], LawForm(*law["form"].tolist()), law["values"], law["equivalent"])
+            ModeLaw(
+                law["mode"],
+                law["sensor"],
+                LawForm(*law["form"].tolist()),
+                law["values"],
+                law["equivalent"],
+                law["gained"],
+            )
             for law in tree.get("laws") or ()
         )
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
@@ -300,7 +307,8 @@ def fit_model(
     """Modes and levels in turn."""
     test = model.test
     assert test.whole is not None
-    stated, least, plain = test.whole.noise, floors(model), test.whole.plain
+    least, plain = floors(model), test.whole.plain
+    stated = None if plain else test.whole.noise
     model = model.at_signal(p)
     if plain:
         levels = plain_levels(model, p)

@@ -205,12 +205,14 @@ class Prepared(SearchSpace):
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
-        return tuple(
+        first, *further = (
             fit_modes(test, delays, calibration) if fit is None else estimate(fit, calibration)
             for test, delays, calibration, fit in zip(
                 self.stated.tests, self.delays, self._calibrations, self._fits, strict=True
             )
         )
+        asked = self.stated.amplitude if self._fits[0] is None else None  # a stored fit has its laws
+        return (follow_amplitude(first, asked, FitMonitor()), *further)
 
     def fit_lines(
         self, poles: Poles, count: int | None, monitor: IterationMonitor, max_iterations: int
@@ -248,11 +250,8 @@ class Prepared(SearchSpace):
 
     def fit_modes(self, monitor: FitMonitor) -> None:
         """Fit the modes of each test, and the laws that are asked for to the problem's own whole records."""
-        self.modal = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor)
-        if self.stated.amplitude is not None:
-            monitor.begin(1)
-            modal = follow_amplitude(self.modal[0], self.stated.amplitude, monitor)
-            self.modal = (modal, *self.modal[1:])
+        first, *further = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor)
+        self.modal = (follow_amplitude(first, self.stated.amplitude, monitor), *further)
 
     @property
     def laws(self) -> tuple[FittedLaw, ...]:

@@ -87,6 +87,12 @@ class StatedProblem:
         for at, test in enumerate(self.validation):
             instance(f"Problem: validation[{at}]", test, Measurement)
         object.__setattr__(self, "site", user_site())
+        timeless = self.amplitude is not None and not all(test.is_in_time for test in self.validation)
+        refuse((
+            timeless,
+            "Problem: modes that follow their amplitude predict records alone, and a validation test holds spectra "
+            "without a sample rate: make it of records (Measurement.from_time)",
+        ))  # fmt: skip
         self._check_records()
         self._check_declarations()
 

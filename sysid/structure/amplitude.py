@@ -54,9 +54,10 @@ class AmplitudeLaw:
         modes = tuple(whole_number("AmplitudeLaw: a mode", mode, at_least=1) for mode in self.modes)
         refuse((len(set(modes)) < len(modes), f"AmplitudeLaw: modes = {list(modes)} names a mode twice"))
         object.__setattr__(self, "modes", modes)
-        if self.exponents == "auto":
+        if isinstance(self.exponents, str) and self.exponents == "auto":
             return
         sound = isinstance(self.exponents, list | tuple) and len(self.exponents) == 2
+        sound = sound and all(isinstance(one, int | float) for one in self.exponents)
         sound = sound and self.exponents[0] in OF_FREQUENCY and self.exponents[1] in OF_DAMPING
         if not sound:
             raise InputError(
@@ -123,6 +124,8 @@ class FittedLaw:
         m/s², that the mode moved at: all but a twentieth of the time above the first, never above the second.
     covariance : (2 + k, 2 + k)
         Of the logarithms of frequency and ratio, and of the values.
+    likelier : bool
+        Whether the fit with the law is likelier than that without, beyond chance.
     """
 
     frequency: float
@@ -132,6 +135,7 @@ class FittedLaw:
     values: Array
     levels: tuple[float, float]
     covariance: Array
+    likelier: bool
 
     @property
     def is_certain(self) -> bool:
@@ -140,7 +144,7 @@ class FittedLaw:
         size = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         unit = self.values / size
         away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
-        return away > beyond_chance(self.values.size)
+        return self.likelier and away > beyond_chance(self.values.size)
 
     def at(self, level: float) -> tuple[float, float]:
         """Frequency, Hz, and damping ratio at a level, m/s²."""
@@ -150,7 +154,7 @@ class FittedLaw:
     def changes_at(self, level: float, omega: float, ratio: float) -> tuple[float, float]:
         """``w² - w0²`` and ``2 (zeta w - zeta0 w0)`` at a level, of a mode of `omega`, rad/s, and `ratio` at rest."""
         frequency, damping = self.at(level)
-        w, zeta = omega * frequency / self.frequency, ratio + damping - self.ratio
+        w, zeta = omega * frequency / self.frequency, min(max(ratio + damping - self.ratio, 0.0), MOST_DAMPED)
         return w**2 - omega**2, 2 * (zeta * w - ratio * omega)
 
     def change(self) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -75,7 +75,9 @@ def test_derivatives_are_those_of_differences(form):
 
 
 def law(fall=0.03, rise=0.01):
-    return FittedLaw(4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([fall, rise]), (0.1, 20.0), 1e-8 * np.eye(4))
+    return FittedLaw(
+        4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([fall, rise]), (0.1, 20.0), 1e-8 * np.eye(4), 99.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +121,7 @@ def test_a_stored_structure_keeps_its_laws(linear):
 def test_deviations_are_those_of_draws():
     rng = np.random.default_rng(0)
     covariance = np.diag([1e-4, 1e-3, 2e-3, 1e-3]) ** 2
-    one = FittedLaw(4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([0.03, 0.01]), (0.1, 20.0), covariance)
+    one = FittedLaw(4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([0.03, 0.01]), (0.1, 20.0), covariance, True)
     draws = rng.multivariate_normal(np.concatenate([np.log([4.0, 0.012]), one.values]), covariance, 4000)
     seen = np.exp(draws[:, 0]) * (1 - draws[:, 2] * np.sqrt(5.0 / 20.0))
     assert one.deviations_at(5.0)[0] == pytest.approx(seen.std(), rel=0.05)

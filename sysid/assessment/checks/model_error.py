@@ -16,6 +16,7 @@ from sysid.measurement.in_time import levels_are_known, peaks
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.law_spectra import without_laws
 from sysid.modal_analysis.misfit import without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import HUBER
@@ -96,7 +97,8 @@ def _unfitted(context: Context) -> Iterator[tuple[int, Measurement]]:
     for i, test in enumerate(context.problem.validation, start=1):
         inside = (test.freq >= first) & (test.freq <= last) | (not context.problem.answers_in_band)
         if np.any(test.base[..., inside]) and np.any(test.response[..., inside]):
-            yield i, without_transients_of(test.at(inside), context.end.structure)
+            structure = context.end.structure  # a law moves under the base at all lines
+            yield i, without_transients_of(without_laws(test, structure).at(inside), structure.with_laws(()))
 
 
 def other_levels(context: Context) -> Iterator[Finding]:
@@ -249,10 +251,13 @@ def changing(problem: Prepared, severity: Severity = Severity.CONTRADICTS) -> tu
 
 
 def laws_of_amplitude(context: Context) -> Iterator[Finding]:
-    """Modes do not follow their amplitude, or what they do is not determined, though this was asked for."""
+    """Modes that were asked to follow their amplitude: they do, they are linear, or the records do not tell."""
     asked = context.problem.stated.amplitude
     if asked is None:
         return
+    if not context.modal.laws:
+        sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
+        yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
     for mode, law in zip(asked.modes, context.modal.laws, strict=False):
         low, high = law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
@@ -266,18 +271,17 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
                 f"{100 * f:.2g} % (+- {100 * LIKELY * std:.2g} %) and its damping ratio by {100 * zeta:.2g} % of "
                 f"critical (+- {100 * LIKELY * of_damping:.2g})", numbers=numbers,
             )  # fmt: skip
-        elif LIKELY * std < law.ratio:  # less than half the half-power width
+        elif 4 * (most := abs(f) + LIKELY * std) < law.ratio:  # an eighth of the half-power width
             yield Finding(
                 "linear", Severity.NOTE,
-                f"mode {mode} is linear {over}: its frequency changes by less than "
-                f"{100 * (abs(f) + LIKELY * std):.2g} %",
+                f"mode {mode} is linear {over}: its frequency changes by less than {100 * most:.2g} %",
                 numbers=numbers,
             )  # fmt: skip
         else:
             yield Finding(
                 "amplitude open", Severity.CAUTION,
-                f"whether mode {mode} follows its amplitude is not determined {over}: a change of its frequency is "
-                f"known to +- {100 * LIKELY * std:.2g} %, more than half of its half-power width",
+                f"whether mode {mode} follows its amplitude is not determined {over}: its frequency may change by up to "
+                f"{100 * most:.2g} %, which is more than an eighth of its half-power width",
                 "test at several levels, the lowest a tenth of the highest, each for longer", numbers=numbers,
             )  # fmt: skip
 
