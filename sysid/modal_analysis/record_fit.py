@@ -207,17 +207,7 @@ class RecordFit:
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
-        laws = tuple(
-            ModeLaw(
-                law["mode"],
-                law["sensor"],
-                LawForm(*law["form"].tolist()),
-                law["values"],
-                law["equivalent"],
-                law["gained"],
-            )
-            for law in tree.get("laws") or ()
-        )
+        laws = tuple(ModeLaw(**{**law, "form": LawForm(*law["form"].tolist())}) for law in tree.get("laws") or ())
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
         fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels

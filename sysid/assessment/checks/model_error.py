@@ -280,8 +280,8 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         else:
             yield Finding(
                 "amplitude open", Severity.CAUTION,
-                f"whether mode {mode} follows its amplitude is not determined {over}: its frequency may change by up to "
-                f"{100 * most:.2g} %, which is more than an eighth of its half-power width",
+                f"whether mode {mode} follows its amplitude is not determined {over}: its frequency may change by up "
+                f"to {100 * most:.2g} %, which is more than an eighth of its half-power width",
                 "test at several levels, the lowest a tenth of the highest, each for longer", numbers=numbers,
             )  # fmt: skip
 
