@@ -239,7 +239,7 @@ BENCHMARKS = (
     ),
     Benchmark(
         "laboratory.kinds_of_test",
-        "nine kinds of test as their files, by the command line, beside the truth",
+        "ten kinds of test as their files, by the command line, beside the truth",
         "3 h",
         "20 s",
         timed=True,

@@ -1,4 +1,4 @@
-"""The nine kinds of test that laboratories run, each as the files that it leaves and the truth behind them."""
+"""The ten kinds of test that laboratories run, each as the files that it leaves and the truth behind them."""
 
 from __future__ import annotations
 

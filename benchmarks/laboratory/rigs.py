@@ -1,4 +1,4 @@
-"""Structures of the nine kinds of test, with their sensors, by the finite elements of `benchmarks.band`.
+"""Structures of the ten kinds of test, with their sensors, by the finite elements of `benchmarks.band`.
 
 All stiffnesses of one are scaled so that its first mode has a drawn frequency. The base moves up to a frequency between
 two modes, so that the modes in the lines are known.

@@ -113,3 +113,13 @@ def test_functions_in_python_take_coherences_too():
         sysid.Measurement.from_frf(FREQ, H, rigid_body=np.ones((3, 1)), coherence=0.9)
     with pytest.raises(InputError, match="between 0 and 1"):
         sysid.Measurement.from_frf(FREQ, H, coherence=1.2, **given)
+
+
+def test_coherences_of_functions_of_one_direction_have_a_row_a_sensor():
+    freq, functions = np.linspace(1.0, 20.0, 8), np.ones((3, 8)) + 0.5j
+    given = {"averages": 40, "rigid_body": np.ones((3, 1))}
+    test = sysid.Measurement.from_frf(freq, functions, coherence=np.full((3, 8), 0.9), **given)
+    alike = sysid.Measurement.from_frf(freq, functions, coherence=np.full(8, 0.9), **given)
+    np.testing.assert_array_equal(test.response_std, alike.response_std)
+    with pytest.raises(InputError, match=r"coherence is \(3, 7\)"):
+        sysid.Measurement.from_frf(freq, functions, coherence=np.full((3, 7), 0.9), **given)
