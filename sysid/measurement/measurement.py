@@ -14,7 +14,6 @@ from sysid.errors import (
     as_float,
     check_frequencies,
     choice,
-    finite_array,
     numbers,
     refuse,
     sequence,
@@ -379,15 +378,7 @@ class Measurement:
             raise InputError(f"force is {F.shape}; with {d} base directions it is {(d, d, lines.size)}: {FORCE_NEEDED}")
         for name, function, known in (("coherence", H, coherence), ("force_coherence", F, force_coherence)):
             if known is not None and function is not None:
-                seen = finite_array(name, known)
-                seen = seen[:, None] if seen.ndim == 2 else seen  # of one base direction, as the functions
-                try:
-                    seen = np.broadcast_to(seen, function.shape)
-                except ValueError:
-                    raise InputError(
-                        f"{name} is {np.shape(known)}: one a function and line, {function.shape}"
-                    ) from None
-                refuse((bool(np.any((seen < 0) | (seen > 1))), f"{name} is between 0 and 1"))
+                seen = spectra.coherence_of(name, known, function.shape)
                 count = whole_number("averages", averages, at_least=2)
                 std = spectra.std_of_functions(function, seen, count, hann=window == "hann")
                 response_std, force_std = (std, force_std) if function is H else (response_std, std)

@@ -211,6 +211,18 @@ def std_of_functions(H: ComplexArray, coherence: Array, averages: int, *, hann: 
     return std
 
 
+def coherence_of(name: str, given: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Coherences of functions of this shape, one a function and line; the axis of one base direction may be missing."""
+    known = finite_array(name, given)
+    try:
+        known = np.broadcast_to(known[:, None] if known.ndim == 2 else known, shape)
+    except ValueError:
+        raise InputError(f"{name} is {known.shape}: one a function and line, {shape}") from None
+    if np.any((known < 0) | (known > 1)):
+        raise InputError(f"{name} is between 0 and 1")
+    return known
+
+
 def _check_independent(S_xx: ComplexArray) -> None:
     """Refuse base spectra (n_freq, d, d) of directions that do not move, or not by themselves."""
     size = np.sqrt(np.einsum("fii->fi", S_xx).real)
