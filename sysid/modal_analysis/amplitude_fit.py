@@ -192,16 +192,14 @@ def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tupl
 
 def _envelopes(fit: RecordFit, mode: int, sensor: int) -> list[Array]:
     """Level of a mode at a sensor at all samples of each run, m/s²."""
-    whole, parts = fit.model.whole, []
-    for number, samples in enumerate(whole.samples):
-        spectrum = np.zeros(samples, complex)
-        for chunk in fit.model.chunks(fit.parameters):
-            if chunk.run.number == number:
-                at = np.round(chunk.run.w / (2 * np.pi) * samples / whole.sample_rate).astype(int)
-                spectrum[at] = 2 * chunk.motion[mode]  # analytic: its modulus is the envelope
-        size = abs(fit.parameters.modes.phi[sensor, mode]) * whole.sample_rate
-        parts.append(np.abs(np.fft.ifft(spectrum)) * size)
-    return parts
+    whole = fit.model.whole
+    spectra = [np.zeros(samples, complex) for samples in whole.samples]
+    for chunk in fit.model.chunks(fit.parameters):
+        spectrum = spectra[chunk.run.number]
+        at = np.round(chunk.run.w / (2 * np.pi) * spectrum.size / whole.sample_rate).astype(int)
+        spectrum[at] = 2 * chunk.motion[mode]  # analytic: its modulus is the envelope
+    size = abs(fit.parameters.modes.phi[sensor, mode]) * whole.sample_rate
+    return [np.abs(np.fft.ifft(spectrum)) * size for spectrum in spectra]
 
 
 def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:

@@ -308,7 +308,7 @@ def fit_model(
         levels = rough_levels(model, p)
     settled, chi2, equations = False, np.inf, _Equations(model, coarse)
     for round_ in range(limits.rounds):
-        if model.whole.grows:  # held within a round: varying without log det it would bias the modes
+        if round_ and model.whole.grows:  # held within a round: varying without log det it would bias the modes
             model = model.at_signal(p)
             equations = _Equations(model, coarse and coarse.at_signal(p))
         p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), equations)

@@ -70,7 +70,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
         found = [*closed, *found]
     strategy, ending = Finding("strategy", Severity.NOTE, why), Finding("ending", Severity.NOTE, end.message)
     it = Identification(
-        structure=end.structure.with_laws(prepared.laws),
+        structure=end.structure,
         problem=problem,
         prepared=prepared,
         x=end.x,

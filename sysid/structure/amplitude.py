@@ -8,7 +8,7 @@ A mode of frequency w and damping ratio zeta moves by ``q'' + 2 zeta(A) w(A) q' 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -159,24 +159,27 @@ class FittedLaw:
 
     def change(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Relative change of the frequency, and change of the damping ratio, over the levels, with their deviations."""
-        x = ca.SX.sym("x", 2 + self.values.size)
-        low, high = (self.form.at(ca.SX(level), ca.exp(x[0]), ca.exp(x[1]), x[2:]) for level in self.levels)
-        both = ca.vertcat(high[0] / low[0] - 1, high[1] - low[1])
-        function = ca.Function("change", [x], [both, ca.jacobian(both, x)])
-        change, J = function(np.concatenate([np.log([self.frequency, self.ratio]), self.values]))
-        J = np.asarray(J.full())
-        std = np.sqrt(np.maximum(np.diag(J @ self.covariance @ J.T), 0.0))
-        f, zeta = np.asarray(change).ravel()
-        return (float(f), float(zeta)), (float(std[0]), float(std[1]))
+        low, high = self.levels
+
+        def of_levels(at: Callable[[float], tuple[ca.SX, ca.SX]]) -> ca.SX:
+            return ca.vertcat(at(high)[0] / at(low)[0] - 1, at(high)[1] - at(low)[1])
+
+        return self._with_deviations(of_levels)
 
     def deviations_at(self, level: float) -> tuple[float, float]:
         """Standard deviations of both, to first order."""
+        return self._with_deviations(lambda at: ca.vertcat(*at(level)))[1]
+
+    def _with_deviations(
+        self, of_levels: Callable[[Callable[[float], tuple[ca.SX, ca.SX]]], ca.SX]
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Two numbers that follow from frequency and damping at some levels, and their deviations, to first order."""
         x = ca.SX.sym("x", 2 + self.values.size)
-        both = ca.vertcat(*self.form.at(ca.SX(level), ca.exp(x[0]), ca.exp(x[1]), x[2:]))
-        slope = ca.Function("slope", [x], [ca.jacobian(both, x)])
-        J = np.asarray(slope(np.concatenate([np.log([self.frequency, self.ratio]), self.values])).full())
-        w, zeta = np.sqrt(np.maximum(np.diag(J @ self.covariance @ J.T), 0.0))
-        return float(w), float(zeta)
+        both = of_levels(lambda level: self.form.at(ca.SX(level), ca.exp(x[0]), ca.exp(x[1]), x[2:]))
+        function = ca.Function("both", [x], [both, ca.jacobian(both, x)])
+        values, J = (part.full() for part in function(np.append(np.log([self.frequency, self.ratio]), self.values)))
+        first, second = np.sqrt(np.maximum(np.diag(J @ self.covariance @ J.T), 0.0))
+        return (float(values[0, 0]), float(values[1, 0])), (float(first), float(second))
 
 
 @functools.cache
