@@ -116,13 +116,14 @@ def _turned(structure: Structure, signs: Array, sensors: tuple[Sensor, ...]) -> 
     """The structure with sensors of these signs turned, and with them the degrees of freedom that they record."""
     recorded, beyond = structure.dof_sensors, structure.residual
     of_dofs = np.where(recorded >= 0, signs[recorded], 1.0)
+    coupling = None if beyond.coupling is None else beyond.coupling * np.append(of_dofs, np.ones(beyond.count))
     both, by_ratios = np.concatenate([of_dofs, np.ones(structure.n_base)]), structure.modal_damping
     return Structure(
         structure.mass * np.outer(both, both), structure.stiffness * np.outer(both, both),
         structure.damping_ratios if by_ratios else None, n_base=structure.n_base,
         damping_matrix=None if by_ratios else structure.damping * np.outer(of_dofs, of_dofs),
         rigid_body=structure.rigid_body * signs[:, None], recovery=structure.recovery * np.outer(signs, of_dofs),
-        sensors=sensors, residual=replace(beyond, shapes=beyond.shapes * signs[:, None]),
+        sensors=sensors, residual=replace(beyond, shapes=beyond.shapes * signs[:, None], coupling=coupling),
     )  # fmt: skip
 
 

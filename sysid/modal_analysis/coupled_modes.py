@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
-from sysid.modal_analysis.model_order import least_worth
+from sysid.modal_analysis.model_order import at_static_pole, least_worth, misses_modes_above
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     TRIAL,
@@ -30,6 +30,7 @@ from sysid.modal_analysis.record_fit import (
     worth,
 )
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.structure.simulation import ModalModel
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
@@ -41,21 +42,24 @@ def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[
     return score(equations, own)
 
 
-def passive(p: Parameters) -> bool:
+def passive(p: Parameters, last: float = np.inf) -> bool:
     """True where the damping takes energy out of every motion: ``Phi' C Phi`` is positive semidefinite.
 
+    It is that of modes up to the last line, rad/s: losses of those above are hardly seen, and all have to be stable.
     Where no force weighed the modes their scales are open, and this asks for more than has to be: late channels would
     pass for couplings that need not be symmetric.
     """
     assert p.coupling is not None
-    loss = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2
-    return bool(np.linalg.eigvalsh(loss)[0] >= 0)
+    loss, omega = np.diag(2 * p.modes.ratios * p.modes.omega) + (p.coupling + p.coupling.T) / 2, p.modes.omega
+    inside = np.ix_(omega <= last, omega <= last)
+    poles = np.linalg.eigvals(ModalModel(omega, loss, p.modes.gamma).state_matrix)
+    return bool(np.linalg.eigvalsh(loss[inside]).min(initial=np.inf) >= 0 and poles.real.max() <= 0)
 
 
 def in_the_lines_alone(model: SpectralModel, p: Parameters, levels: Array, beyond: float) -> Parameters | None:
     """Parameters without couplings of modes within the lines with those beyond; None where these matter.
 
-    An answer in the band has no place for them. `beyond` is the variance of a real number, in units of the levels.
+    Plain spectra have no place for them. `beyond` is the variance of a real number, in units of the levels.
     """
     assert p.coupling is not None
     first, last = 2 * np.pi * model.test.freq[model.test.freq > 0][[0, -1]]
@@ -84,23 +88,43 @@ def with_couplings(
     # What modes above the lines leave would pass for couplings of those that stand for them.
     if promised < max(beyond * beyond_chance(count), score(equations, above)[0]):
         return fit
-    first = replace(p, coupling=np.zeros((m, m)))
     monitor.doing = f"{m} modes and the dampers between them"
-    rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor))
+    more = _coupled(fit, p, fit.static, pruned, some, monitor)
+    if not fit.static and model.force and misses_modes_above(more):  # which dampers couple with those in the lines
+        static = refitted(fit, at_static_pole(fit), some=some, limits=ROUGH, monitor=monitor, static=model.d)
+        other = _coupled(fit, static.parameters, model.d, pruned, some, monitor)
+        more = max(more, other, key=lambda one: one.schwarz)
+    if not more.settled:
+        more = refitted(more, more.parameters, some=some, monitor=monitor)
+    gained = 2 * (more.likelihood - fit.likelihood)
+    least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
+    single = more.parameters.coupling is None  # where one mode is left
+    if single or not (
+        more.settled and passive(more.parameters, 2 * np.pi * fit.test.freq[-1]) and gained > beyond * least
+    ):
+        return fit
+    alone = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
+    if alone is None:
+        return more if model.force else fit  # which weighs the modes, so that couplings are symmetric
+    return replace(more, parameters=alone)
+
+
+def _coupled(
+    fit: RecordFit, p: Parameters, static: int, pruned: Callable[[RecordFit], RecordFit],
+    some: Measurement | None, monitor: FitMonitor,
+) -> RecordFit:  # fmt: skip
+    """The fit from parameters without couplings, with these, and without modes that stood for them."""
+    first = replace(p, coupling=np.zeros((p.modes.omega.size,) * 2))
+    rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor, static=static))
     more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
-    while more.model.m > 2:  # one that stood for couplings may be worth much beside these, until the others have moved
-        poorest = np.arange(more.model.m) == np.argmin(worth(more))
+    while more.model.m - static > 2:  # one may be worth much beside couplings, until the others have moved
+        value = worth(more)[: more.model.m - static]
+        poorest = np.arange(more.model.m) == np.argmin(value)
         fewer = refitted(more, without(more, poorest), some=some, limits=TRIAL, monitor=monitor)
         if not fewer.settled or more.likelihood - fewer.likelihood > least_worth(more.model):
             break
         more = fewer
-    gained = 2 * (more.likelihood - fit.likelihood)
-    least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
-    alone = more.parameters.coupling is None  # where one mode is left
-    if alone or not (more.settled and passive(more.parameters) and gained > beyond * least):
-        return fit
-    own = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
-    return fit if own is None else replace(more, parameters=own)
+    return more
 
 
 def coupling_of(

@@ -141,7 +141,7 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     stays = np.count_nonzero(p.modes.omega <= last) == np.count_nonzero(fit.modes.omega <= last)
     stays &= not fit.static or bool(np.all(p.modes.omega[own] < p.modes.omega[-1]))
     enough = 2 * (here.chi2 - chi2) >= variance * beyond_chance(count)
-    if not (settled and stays and enough and passive(p)):
+    if not (settled and stays and enough and passive(p, last)):
         return modal
     alone = in_the_lines_alone(model, p, model.levels, variance)
     return modal if alone is None else _estimate(modal, model, alone, chi2, variance)

@@ -275,6 +275,7 @@ def _least(fit: RecordFit) -> NDArray[np.bool_]:
     """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
+    value[m - fit.static :] = np.inf
     first, *others = np.argsort(value, kind="stable")
     gone = (np.arange(m) == first) & (value < least) & (m > 1)
     for k in others[:-1]:

@@ -74,7 +74,7 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
         poor = no_modes(more)
         if p.modes.omega.size > m + 1:
             poor |= worth(more) < _PROMISING * least
-        poor[:m] = False
+        poor[: m - fit.static] = poor[poor.size - fit.static :] = False
         if not np.any(poor):
             break
         p = without(more, poor)
@@ -116,23 +116,10 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
 
     See `ModeFit.with_static` of spectra.
     """
-    test, p, d = fit.test, fit.parameters, fit.test.n_base
-    if fit.static or fit.stopped:
+    test, d = fit.test, fit.test.n_base
+    if fit.static or fit.stopped or not misses_modes_above(fit):
         return fit
-    worth, rise = _rise(fit)
-    if worth < beyond_chance(rise.size):
-        return fit
-    times, ratio = STATIC_POLE
-    far = times * 2 * np.pi * float(test.freq[-1])
-    p = without(fit, p.modes.omega >= far)
-    if fit.model.force:
-        spare = np.diag(p.rigid - p.modes.gamma.T @ p.modes.gamma)
-        gamma = np.sqrt(_LIGHT * np.maximum(spare, _LIGHT * np.diag(p.rigid)))
-    else:
-        gamma = np.sqrt(np.mean(p.modes.gamma**2, axis=0))
-    phi, held = times**2 * rise / gamma, np.full(d, far)
-    modes = p.modes.joined(Modes(phi, np.diag(gamma), held, np.full(d, ratio)))
-    first = p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
+    first, far = at_static_pole(fit), STATIC_POLE[0] * 2 * np.pi * float(test.freq[-1])
     monitor = monitor or FitMonitor()
     monitor.doing = "modes above the lines"
     more = refitted(fit, first, monitor=monitor, static=d)
@@ -145,6 +132,28 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
     return _in_gauge(_with_poles_above(more, monitor))
+
+
+def misses_modes_above(fit: RecordFit) -> bool:
+    """True where what grows as w² in the sensors is left beyond chance."""
+    worth, rise = _rise(fit)
+    return worth >= beyond_chance(rise.size)
+
+
+def at_static_pole(fit: RecordFit) -> Parameters:
+    """Parameters of a fit with static modes at its end, which begin with what grows as w² in the sensors."""
+    p, d, rise = fit.parameters, fit.test.n_base, _rise(fit)[1]
+    times, ratio = STATIC_POLE
+    far = times * 2 * np.pi * float(fit.test.freq[-1])
+    p = without(fit, p.modes.omega >= far)
+    if fit.model.force:
+        spare = np.diag(p.rigid - p.modes.gamma.T @ p.modes.gamma)
+        gamma = np.sqrt(_LIGHT * np.maximum(spare, _LIGHT * np.diag(p.rigid)))
+    else:
+        gamma = np.sqrt(np.mean(p.modes.gamma**2, axis=0))
+    phi, held = times**2 * rise / gamma, np.full(d, far)
+    modes = p.modes.joined(Modes(phi, np.diag(gamma), held, np.full(d, ratio)))
+    return p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
 
 
 def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
@@ -160,8 +169,7 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         peak = next((one for one in peaks_of(fit, price) if last < one.omega < far), None)
         if peak is None:
             return fit
-        before_static = np.insert(np.arange(m), m - fit.static, m)
-        more = refitted(fit, _with(fit, fit.parameters, peak).at(before_static), monitor=monitor)
+        more = refitted(fit, _with(fit, fit.parameters, peak), monitor=monitor)
         omega = more.parameters.modes.omega[: -fit.static]
         stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
         if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):
@@ -336,7 +344,7 @@ def peaks_of(fit: RecordFit, least: float, widths: float = 5.0) -> list[Peak]:
 
 
 def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
-    """Parameters with one more mode."""
+    """Parameters with one more mode, before those that are static."""
     model, (omega, ratio, shape, push) = fit.model, peak
     n, d = model.n, model.d
     phi, gamma = shape[:n], push[:d]
@@ -347,7 +355,8 @@ def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
         phi, gamma, push = phi / scale, gamma * scale, push * scale
     modes = p.modes
     more = modes.joined(Modes(phi[:, None], gamma[None], np.atleast_1d(omega), np.atleast_1d(ratio)))
-    return p.with_modes(more, np.vstack([p.ends, push[d:]]))
+    m = modes.omega.size
+    return p.with_modes(more, np.vstack([p.ends, push[d:]])).at(np.insert(np.arange(m), m - fit.static, m))
 
 
 _MORE = 4.0  # times what a mode must be worth where noise alone is left
@@ -361,6 +370,8 @@ def without_spurious_modes(
     Where lines are many, `some` is the test at a few of them, as in `refitted`.
     """
     first, test = fit, fit.test
+    if fit.static:  # new residues would be without them
+        return fit
     while np.any(least := _spurious(fit)):
         # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes

@@ -95,7 +95,8 @@ class RecordModel(SpectralModel):
         test, m = self.test, self.m
         self.traces, self.n_ends = traces, m * 2 * len(self.moving)
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
-        self.coupled = pairs_of(m - static, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
+        self.coupled = pairs_of(m, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
+        self.coupled = self.coupled[np.min(self.coupled, axis=1) < m - static]  # static ones stand at one pole
         self.coupling = slice(before, before + len(self.coupled))
         self.of_laws = slice(self.coupling.stop, self.coupling.stop + sum(law.form.size for law in self.laws))
         self.of_gains = slice(self.of_laws.stop, self.of_laws.stop + self.by_gains.shape[2])

@@ -125,11 +125,11 @@ class Modal:
 
 def structure_of_modes(
     problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool,
-    residual: ResidualModes, coupling: Array | None = None,
+    residual: ResidualModes, coupling: Array | None = None, across: Array | None = None,
 ) -> Structure:  # fmt: skip
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
-    Dampers that couple the modes have ``Phi' C Phi`` off its diagonal, `coupling` (m, m), rad/s.
+    Dampers have ``Phi' C Phi`` off its diagonal: `coupling` (m, m), rad/s; of residual modes `across` (r, m + r).
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
     """
     geometry = problem.geometry
@@ -143,6 +143,8 @@ def structure_of_modes(
         known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma, residual = P * np.sqrt(t), gamma * np.sqrt(t), residual.scaled(np.sqrt(t))
+    if across is not None and np.any(across):
+        residual = replace(residual, coupling=np.hstack([across[:, : len(P)] @ P, across[:, len(P) :]]))
     M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
     M_S0 = P.T @ gamma - M_SS @ G
     delta = gamma - P @ G
@@ -298,10 +300,10 @@ def modal_structure(
         residual = residual.without_mass(problem.totals)  # nothing weighs them
     # A stated total is kept, even where the base force weighs another, but not where it misses modes below the lines.
     kept = mass.totals is not None and held is None and not later and end.modes.omega.min() >= 2 * np.pi * test.freq[0]
-    unmet = mass.free and (test.force is None or kept)
+    unmet, (coupling, across) = mass.free and (test.force is None or kept), _coupling(problem, end)
     try:
         structure = structure_of_modes(
-            problem, modes, remainder, chosen, to_totals=unmet, residual=residual, coupling=_coupling(problem, end)
+            problem, modes, remainder, chosen, to_totals=unmet, residual=residual, coupling=coupling, across=across
         )  # fmt: skip
         return structure, end, chosen, poles
     except InputError as error:
@@ -319,14 +321,16 @@ def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     return end.modes.at(inside), residual
 
 
-def _coupling(problem: Prepared, end: ModalFit) -> Array | None:
-    """Couplings of the modes of the structure by dampers, (m, m), as they follow where a fit ended; None without."""
+def _coupling(problem: Prepared, end: ModalFit) -> tuple[Array | None, Array | None]:
+    """Couplings by dampers where a fit ended: of the structure's modes, and of residual ones; None without."""
     modal = problem.modal[0]
     if modal.coupling is None:
-        return None
+        return None, None
     index, inside = index_of(modal), problem.of_structure(end.modes.omega)
     step = theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index)
-    return modal.coupling.about(step)[np.ix_(inside, inside)]
+    found = modal.coupling.about(step)
+    order = np.concatenate([np.flatnonzero(inside), np.flatnonzero(~inside)])
+    return found[np.ix_(inside, inside)], found[np.ix_(~inside, order)]
 
 
 def _modes_asked(problem: Prepared, options: Modal) -> int | None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sysid.structure.thresholds import ROUND_OFF
 
 Array = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 
 class ModalModel(NamedTuple):
@@ -25,6 +26,12 @@ class ModalModel(NamedTuple):
     omega: Array
     damping: Array
     participation: Array
+
+    def motion(self, freq: Array) -> ComplexArray:
+        """Modal accelerations at lines in Hz per unit base acceleration, (n, d, n_freq)."""
+        w = 2 * np.pi * freq[:, None, None]
+        dynamic = np.diag(self.omega**2) - w**2 * np.eye(self.omega.size) + 1j * w * self.damping
+        return np.moveaxis(np.linalg.solve(dynamic, w**2 * self.participation + 0j), 0, -1)
 
     @property
     def state_matrix(self) -> Array:
@@ -53,8 +60,8 @@ def modal_accelerations(modes: ModalModel, base: Array, sample_rate: float, init
     return modes.to_acceleration @ states.T - modes.participation @ base
 
 
-def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate: float) -> Array:
-    """First state (2, n) whose free vibration is nearest to `residual` (n_sensors, n_samples), in least squares."""
+def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate: float, n: int) -> Array:
+    """First state (2, n) of the first n modes whose free vibration is nearest to `residual` (n_sensors, n_samples)."""
     transition = scipy.linalg.expm(modes.state_matrix / sample_rate)
     scale = np.concatenate([modes.omega, modes.omega])  # a state y makes accelerations of w y
     row = shapes @ modes.to_acceleration / scale
@@ -73,9 +80,9 @@ def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate:
         if np.linalg.norm(row) <= ROUND_OFF * size:
             break
     # Of motion that no sensor sees the least is taken: none.
-    state = np.linalg.lstsq(reduced[:, :-1], reduced[:, -1], rcond=1e-10)[0] / scale
-    n = modes.omega.size
-    return np.array([state[:n] / modes.omega, state[n:]])
+    moved = np.append(np.arange(n), modes.omega.size + np.arange(n))
+    state = np.linalg.lstsq(reduced[:, moved], reduced[:, -1], rcond=1e-10)[0] / scale[moved]
+    return np.array([state[:n] / modes.omega[:n], state[n:]])
 
 
 def _step(modes: ModalModel, step: float, degree: int) -> tuple[Array, Array]:

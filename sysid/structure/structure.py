@@ -162,6 +162,8 @@ class Structure:
         theirs, ours = (len(residual.shapes), residual.participation.shape[1]), (self.n_sensors, self.n_base)
         words = "the residual modes are of {} sensors and {} base directions, the structure of {} and {}"
         refuse((theirs != ours, words.format(*theirs, *ours)))
+        if residual.coupling is not None:
+            shaped_array("residual coupling", residual.coupling, residual.count, self.n + residual.count)
         self.residual = residual
 
     def with_residual(self, residual: ResidualModes) -> Structure:
@@ -263,8 +265,10 @@ class Structure:
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
         lines = check_frequencies(freq, increasing=False)
-        own = np.tensordot(self.recovery, self._relative(lines), 1)
-        return own + np.tensordot(self.residual.shapes, self.residual.motion(lines), 1)
+        if self.residual.coupling is not None:
+            return np.asarray(np.tensordot(self._all_shapes, self._modal_model.motion(lines), 1), dtype=complex)
+        beyond = np.tensordot(self.residual.shapes, self.residual.motion(lines), 1)
+        return np.tensordot(self.recovery, self._relative(lines), 1) + beyond
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -281,6 +285,9 @@ class Structure:
             [force direction, base direction, line].
         """
         lines, beyond = check_frequencies(freq, increasing=False), self.residual
+        if beyond.coupling is not None:
+            every = np.tensordot(self._modal_model.participation.T, self._modal_model.motion(lines), 1)
+            return np.asarray(every + self.rigid_body_mass[:, :, None], dtype=complex)
         own = np.tensordot(self._coupling.T, self._relative(lines), 1)
         others: ComplexArray = np.einsum("ki,kjf->ijf", beyond.participation, beyond.motion(lines))
         others += own + self.rigid_body_mass[:, :, None]
@@ -354,19 +361,25 @@ class Structure:
         samples = np.shape(base)[-1] if np.ndim(base) else 0
         measured = shaped_array("response", response, self.n_sensors, samples)
         left = measured - self.simulate(base, sample_rate)
-        own = ModalModel(self._omega, self.modal_damping_matrix, self.participation)
-        return fitted_state(own, self.mode_shapes, left, sample_rate)
+        return fitted_state(self._modal_model, self._all_shapes, left, sample_rate, self.n)
 
     @property
     def _modal_model(self) -> ModalModel:
         """The structure's own modes, then the residual ones."""
         beyond = self.residual
-        loss = np.diag(2 * beyond.damping_ratios * beyond.omega)
+        loss = scipy.linalg.block_diag(self.modal_damping_matrix, np.diag(2 * beyond.damping_ratios * beyond.omega))
+        if beyond.coupling is not None:
+            loss += self._across(self.normal_modes)
         return ModalModel(
             np.concatenate([self._omega, beyond.omega]),
-            scipy.linalg.block_diag(self.modal_damping_matrix, loss),
+            loss,
             np.vstack([self.participation, beyond.participation]),
         )
+
+    def _across(self, modes: Array) -> Array:
+        """Damping between residual modes and motions `modes` (n, n) of the degrees of freedom, (n + r, n + r)."""
+        across, among = np.split(np.asarray(self.residual.coupling), [self.n], axis=1)
+        return np.block([[0 * modes, (across @ modes).T], [across @ modes, among]])
 
     @property
     def _all_shapes(self) -> Array:
@@ -407,6 +420,8 @@ class Structure:
         M_inv = scipy.linalg.inv(self.mass[:n, :n])
         spring = join(M_inv @ self.stiffness[:n, :n], np.diag(beyond.omega**2))
         loss = join(M_inv @ self.damping, np.diag(2 * beyond.damping_ratios * beyond.omega))
+        if beyond.coupling is not None:
+            loss += join(M_inv, np.eye(beyond.count)) @ self._across(np.eye(n))
         acceleration = np.hstack([-spring, -loss])
         feed = -np.vstack([M_inv @ self._coupling, beyond.participation])
         A = np.vstack([np.hstack([np.zeros_like(spring), np.eye(len(spring))]), acceleration])

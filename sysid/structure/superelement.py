@@ -35,6 +35,9 @@ class ResidualModes:
     static : int
         So many, the last, stand at frequencies that are held in the fit: they hold the answer, nearly static, of all
         modes above the band.
+    coupling : (r, n + r), optional
+        Loads of these modes by velocities of the n degrees of freedom of their structure, then of themselves, where
+        dampers couple them: what stands off the diagonal of the damping; kg^1/2/s, then rad/s.
 
     Raises
     ------
@@ -52,6 +55,7 @@ class ResidualModes:
     shapes: Array
     participation: Array
     static: int = 0
+    coupling: Array | None = None
 
     def __post_init__(self) -> None:
         for name, *shape in (("natural_frequencies", "r"), ("damping_ratios", "r"), ("shapes", "n_sensors", "r"),

@@ -18,17 +18,29 @@ def split(truth, kept):
     delta = gamma[own] - P @ G
     M_00 = delta.T @ delta + truth.rigid_body_mass - gamma[own].T @ gamma[own]
     K_S0 = -K @ G
-    beyond = ResidualModes(truth.natural_frequencies[kept:], truth.damping_ratios[kept:], phi[:, kept:], gamma[kept:])
+    loss, free = truth.modal_damping_matrix, truth.modal_damping
+    across = np.hstack([loss[kept:, own] @ P, loss[kept:, kept:] - np.diag(np.diag(loss)[kept:])])
+    beyond = ResidualModes(
+        truth.natural_frequencies[kept:], truth.damping_ratios[kept:], phi[:, kept:], gamma[kept:],
+        coupling=None if free else across,
+    )  # fmt: skip
     return Structure(
         np.block([[M, M_S0], [M_S0.T, M_00]]), np.block([[K, K_S0], [K_S0.T, -G.T @ K_S0]]),
-        truth.damping_ratios[own], n_base=truth.n_base, recovery=phi[:, own] @ P, rigid_body=truth.rigid_body,
-        residual=beyond,
+        truth.damping_ratios[own] if free else None, n_base=truth.n_base,
+        damping_matrix=None if free else P.T @ loss[own, own] @ P, recovery=phi[:, own] @ P,
+        rigid_body=truth.rigid_body, residual=beyond,
     )  # fmt: skip
 
 
-@pytest.fixture(params=[1, 3])
+@pytest.fixture(params=[(1, False), (3, False), (1, True), (3, True)])
 def pair(random_structure, request):
-    truth = random_structure(np.random.default_rng(request.param), n=6, d=request.param, base_mass=1.0)
+    d, dashpots = request.param
+    truth = random_structure(np.random.default_rng(d), n=6, d=d, base_mass=1.0)
+    if dashpots:  # which couple modes of the structure with residual ones, and these with each other
+        across = np.random.default_rng(7).normal(size=(6, 2))
+        more = 0.05 * np.trace(truth.damping) * across @ across.T
+        tree = truth.to_tree() | {"damping_ratios": None, "damping_matrix": truth.damping + more}
+        truth = Structure.from_tree(tree)
     return truth, split(truth, 4)
 
 
@@ -92,6 +104,7 @@ def test_they_are_stored_to_the_bit(pair):
     [
         {"natural_frequencies": [10.0, -1.0]}, {"damping_ratios": [0.01, -0.1]}, {"damping_ratios": [0.01]},
         {"shapes": np.ones((6, 3))}, {"shapes": np.ones((5, 2))}, {"participation": np.ones((2, 2))}, {"static": 3},
+        {"coupling": np.ones((2, 5))},
     ],
 )  # fmt: skip
 def test_modes_that_do_not_fit_are_refused(pair, change):

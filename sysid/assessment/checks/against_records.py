@@ -185,9 +185,14 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
         return
     both = records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
-    noise = records.noise(both.left, 2 * extra, least=EXACT)
-    gained = free.squared_error - both.squared_error
-    if gained > noise * beyond_chance(extra, CANDIDATES):
+    # Beside what gains and modes above the lines leave, which pass for motion in quadrature.
+    freq = records.freq
+    beside = records.basis(np.vstack([np.ones(freq.size), modes_above(freq, freq[-1])]) + 0j)
+    plain, left = (_beside(one, beside) for one in (free, both))
+    noise = records.noise(left, 2 * extra + beside.shape[1] * left.shape[1], least=EXACT)
+    gained = float(np.sum(plain**2) - np.sum(left**2))
+    # Of less than half of what is left beside, noise and errors of channels are the larger ones.
+    if gained > max(noise * beyond_chance(extra, CANDIDATES), float(np.sum(left**2)) / 4):
         share = float(np.sqrt(gained / records.size))
         yield Finding(
             "damping", Severity.CONTRADICTS,
@@ -195,6 +200,12 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
             "mode is missing; modal damping ratios are then an approximation",
             numbers={"share": share},
         )  # fmt: skip
+
+
+def _beside(fit: ResidueFit, columns: Array) -> Array:
+    """What is left of the records beside the fit's residues and some columns."""
+    added = np.linalg.qr(columns - fit.Q @ (fit.Q.T @ columns))[0]
+    return np.asarray(fit.left - added @ (added.T @ fit.left))
 
 
 def _couplings(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
