@@ -279,9 +279,13 @@ class _Late:
         return gained > more * np.log(numbers) / 2
 
     def shows_beyond(self, other: _Late) -> bool:
-        """True where it has more unknowns and the likelihood is larger beyond what chance makes of these."""
+        """True where it has more unknowns and the likelihood is larger beyond what chance makes of these.
+
+        Of averages, whose base has noise at the peaks, and what their window blurs, the channels share their errors.
+        """
         gained, more, _ = self._gained_over(other)
-        return more > 0 and 2 * gained > beyond_chance(more, self.delays.size)
+        shared = self.level.size if self.still.averaged else 1
+        return more > 0 and 2 * gained > shared * beyond_chance(more, self.delays.size)
 
     def _gained_over(self, other: _Late) -> tuple[float, int, float]:
         """Likelihood over another's, its logarithm, unknowns more than it has, and independent numbers of both."""
