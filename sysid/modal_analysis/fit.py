@@ -18,6 +18,7 @@ from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
+from sysid.modal_analysis.direct_terms import without_window
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -333,7 +334,7 @@ def fit_modes(
         As `whole_fit` does.
     """
     values, calibration = None if delays is None else delays.values, calibration or Calibration.stated(test)
-    test = calibrated(test, calibration)
+    test = calibrated(without_window(test), calibration)
     if test.whole is None:
         return _of_lines(test, delays, calibration, monitor)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
