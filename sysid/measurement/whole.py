@@ -141,6 +141,10 @@ class WholeRecords:
         taken = delays if self.taken is None else self.taken + delays
         return replace(self, taken=taken if np.any(taken) else None)
 
+    def profile_at(self, lines: NDArray[np.bool_]) -> Array | float:
+        """Noise at lines, (n_freq,), over its level: alike at all."""
+        return 1.0
+
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
 
@@ -191,11 +195,16 @@ class WholeRecords:
         return cls(samples, float(tree["sample_rate"]), rest, noise)
 
 
+@dataclass(frozen=True, eq=False)
 class SteadyLines(WholeRecords):
     """Lines that stand for themselves, without transients, as stepped sines leave them, or an analyser.
 
-    `sample_rate` is their least distance, Hz; variances are those of the complex numbers themselves.
+    `sample_rate` is their least distance, Hz; variances are those of the complex numbers themselves. `profile`,
+    (n_freq,), is the noise of all channels that is no share of their signal, at each line over its level: a dwell of so
+    many cycles holds the more of it the shorter it is, and much at lines about that of the mains. The fit sets it.
     """
+
+    profile: Array | None = field(default=None)
 
     @classmethod
     def of(cls, runs: int, freq: Array, *, grows: bool = True) -> SteadyLines:
@@ -211,6 +220,10 @@ class SteadyLines(WholeRecords):
     def density(self) -> Array:
         """One each."""
         return np.ones(len(self.samples))
+
+    def profile_at(self, lines: NDArray[np.bool_]) -> Array | float:
+        """See `WholeRecords`."""
+        return 1.0 if self.profile is None else self.profile[lines]
 
     def pulses(self, last: float) -> tuple[Array, NDArray[np.bool_]]:
         """None: see `WholeRecords`."""

@@ -75,6 +75,32 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array) -> Array:
     return found * _of_noise(model)
 
 
+def likeliest_profile(model: RecordModel, p: Parameters, levels: Array, shape: Array, beside: Array) -> Array:
+    """Profile of `SteadyLines`, its logarithm (n_freq,) smooth, of the columns of `shape`, and `beside` that.
+
+    The levels are what they are.
+    """
+    each: Array = np.eye(levels.shape[1])
+    every, parts = {0: each}, _parts(model, p)
+    at = [part.run.among(model.test.freq) for part in parts]
+
+    def unlikely(y: Array) -> float:
+        profile = np.exp(shape @ y + beside)
+        turned = [
+            part._replace(run=part.run._replace(piece=0, profile=profile[i])) for part, i in zip(parts, at, strict=True)
+        ]
+        values = [
+            _likelihood([one], every, np.log(levels[part.run.piece]))[0]
+            for one, part in zip(turned, parts, strict=True)
+        ]
+        return -float(np.sum(values))
+
+    first = np.zeros(shape.shape[1])
+    return np.asarray(
+        shape @ scipy.optimize.minimize(unlikely, first, method="BFGS", options={"maxiter": 20}).x + beside
+    )
+
+
 def _of_noise(model: RecordModel) -> float:
     """Factor of variances, of which the unknowns of a fit took a part."""
     return model.numbers / max(model.numbers - model.unknowns, model.numbers / 4)
@@ -216,7 +242,11 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
         excess = np.vstack([_squares(Ge) - 1 + hidden, _squares(TGe) - np.diagonal(TGT).T.real])
         if run.signal is not None:
             # What each level makes of the variance at each line, by its logarithm, over that variance.
-            by = levels[:, None] * np.vstack([np.full_like(v, run.density), run.signal]) / np.tile(v, (2, 1))
+            by = (
+                levels[:, None]
+                * np.vstack([np.full_like(v, run.density) * run.profile, run.signal])
+                / np.tile(v, (2, 1))
+            )
             inverse = np.einsum("jcl,jel->cel", V, V.conj())
             inverse[np.arange(c), np.arange(c)] -= 1
             G = np.concatenate([np.concatenate([inverse, GT.swapaxes(0, 1)], axis=1),
