@@ -13,7 +13,17 @@ from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
-from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, rough_levels, unit_diagonal
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    WHOLE,
+    Limits,
+    RecordFit,
+    half_inverse,
+    refitted,
+    rough_levels,
+    unit_diagonal,
+)
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array, ComplexArray
@@ -65,13 +75,16 @@ def _stages(
         alone = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
     monitor.doing = "a law of amplitude"
-    best = _started(alone, numbers, first, tries, monitor)
+    limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
+    best = _started(alone, numbers, first, tries, limits, monitor)
     yield best, linear
     if stated.exponents == "auto":
-        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
+        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], limits, monitor)
         yield best, linear
-        best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
+        best = _likeliest(best, "of_damping", OF_DAMPING[1:], limits, monitor)
         yield best, linear
+    if plain:
+        best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
     if plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
         noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
@@ -79,7 +92,7 @@ def _stages(
             refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
             for p in (_with_equivalents(best), linear.parameters)
         )
-        yield best, linear
+    yield best, linear
 
 
 def _judged(best: RecordFit, linear: RecordFit) -> RecordFit:
@@ -121,8 +134,9 @@ def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
 
 
 def _started(
-    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
-) -> RecordFit:
+    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
+    monitor: FitMonitor,
+) -> RecordFit:  # fmt: skip
     """Laws of these exponents, from the better of some falls of the frequency."""
     p = linear.parameters
     found = []
@@ -141,43 +155,38 @@ def _started(
         if found[-1].settled:
             break
     best = max(found, key=lambda one: one.likelihood)
-    return refitted(best, _with_equivalents(best), monitor=monitor)
+    return refitted(best, _with_equivalents(best), limits=limits, monitor=monitor)
 
 
 def _likeliest(
-    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], monitor: FitMonitor
-) -> RecordFit:
+    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], limits: Limits,
+    monitor: FitMonitor,
+) -> RecordFit:  # fmt: skip
     """The likeliest of a fit and of those with other exponents."""
     for exponent in exponents:
         monitor.doing = f"a law of amplitude, exponent {exponent:g} {which.replace('_', ' ')}"
-        found = refitted(best, _with_exponent(best, which, exponent), monitor=monitor)
+        found = refitted(best, _with_exponent(best, which, exponent), limits=limits, monitor=monitor)
         if found.likelihood > best.likelihood:
             best = found
     return best
 
 
-def _with_exponent(
-    fit: RecordFit, which: Literal["of_frequency", "of_damping"], exponent: float,
-    shares: tuple[float, float] = (0.3, 0.95),
-) -> Parameters:  # fmt: skip
+def _with_exponent(fit: RecordFit, which: Literal["of_frequency", "of_damping"], exponent: float) -> Parameters:
     """The parameters with another exponent of the laws, which say what they said at two levels.
 
-    These are exceeded but for such shares of the time: from other values damping may be zero at all low levels, where
+    One is exceeded most of the time, one hardly ever: from other values damping may be zero at all low levels, where
     no step shows.
     """
     p, laws = _with_equivalents(fit), []
     omega, ratios = p.modes.omega.copy(), p.modes.ratios.copy()
     for law in p.laws:
-        unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), shares) / law.form.level
+        unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
         number, values, pole = ("of_frequency", "of_damping").index(which), law.values.copy(), [1.0, 1.0]
         before, after = unit ** getattr(law.form, which), unit**exponent
         values[number] *= (before[1] - before[0]) / (after[1] - after[0])
         beside = law.values[number] * before[1] - values[number] * after[1]  # what is left is of any level
-        if which == "of_frequency":
-            pole[0] = 1 - beside
-            values[number] /= pole[0]
-        else:
-            pole[1] = max(1 + beside / ratios[law.mode], 0.1)
+        pole[number] = max(1 + beside / ratios[law.mode], 0.1) if number else 1 - beside
+        values[0] /= pole[0]
         omega[law.mode] *= pole[0]
         ratios[law.mode] *= pole[1]
         form = law.form._replace(**{which: exponent})
