@@ -97,8 +97,15 @@ class RecordedTest:
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
-        """The band that the base excites, Hz (`sysid.excited_band`); None of spectra."""
-        return None if self.sample_rate is None else excited_band(self.runs, self.sample_rate)
+        """The band that the base excites, Hz (`sysid.excited_band`); None of spectra.
+
+        From four periods a record on, as drift of up to two leaks into the lines below.
+        """
+        if self.sample_rate is None:
+            return None
+        low, high = excited_band(self.runs, self.sample_rate)
+        longest = max(base.shape[1] for base, *_ in self.runs)
+        return min(max(low, 3.999 * self.sample_rate / longest), high), high
 
     @property
     def damage(self) -> list[DamagedChannel]:

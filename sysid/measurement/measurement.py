@@ -22,6 +22,7 @@ from sysid.errors import (
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
 from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present
+from sysid.measurement.steady_tones import with_steady_tones
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -481,7 +482,10 @@ class Measurement:
             test = replace(test, averaged=True, damage=sound.damage)
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
-        return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+        test = test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+        parts = tuple(getattr(test, name) for name in _RECORDS[1:4] if getattr(test, name) is not None)
+        tones = test.whole and with_steady_tones(test.whole, test.freq, test.own_lines, *parts)
+        return replace(test, whole=tones)
 
     noise_from_rest = staticmethod(levels_at_rest)
 

@@ -11,13 +11,12 @@ from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
-from sysid.modal_analysis.noise_levels import likeliest_levels, likeliest_profile, plain_levels
+from sysid.modal_analysis.noise_levels import interpolation_matrix, likeliest_levels, likeliest_profile, plain_levels
 from sysid.modal_analysis.record_fit import RecordFit, refitted
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter
 from sysid.modal_analysis.residues import linear_residues
 from sysid.modal_analysis.response import gains
-from sysid.modal_analysis.varying_levels import interpolation_matrix
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import beyond_chance

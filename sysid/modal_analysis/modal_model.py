@@ -452,3 +452,14 @@ def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:
     """Pairs of different modes, (k, 2), each once or, with `both`, in both orders."""
     apart = np.argwhere(~np.eye(m, dtype=bool))
     return apart if both else apart[apart[:, 0] < apart[:, 1]]
+
+
+def segments(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
+    """Stretches of the lines of a run, (L,), rad/s, `most` at most and of so many lines at least: of one level each."""
+    root = np.sqrt(w)
+    bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], most + 1)[1:-1]))
+    cuts = [0]
+    for bound in bounds:
+        if bound - cuts[-1] >= lines and w.size - bound >= lines:
+            cuts.append(int(bound))
+    return [slice(a, b) for a, b in zip(cuts, [*cuts[1:], w.size], strict=True)]

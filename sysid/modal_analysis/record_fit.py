@@ -24,6 +24,7 @@ from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.modal_model import ModeLaw, trace_count
 from sysid.modal_analysis.noise_levels import (
     bounded_by_lines,
+    extra_numbers,
     floors,
     likeliest_levels,
     plain_levels,
@@ -35,7 +36,6 @@ from sysid.modal_analysis.record_model import (
     RecordModel,
 )
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.varying_levels import extra_numbers
 from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF

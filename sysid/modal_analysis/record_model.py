@@ -32,10 +32,10 @@ from sysid.modal_analysis.modal_model import (
     Sums,
     dots,
     pairs_of,
+    segments,
     trace_count,
 )
 from sysid.modal_analysis.response import real_times
-from sysid.modal_analysis.varying_levels import segments
 from sysid.structure.structure import Array, ComplexArray
 
 
