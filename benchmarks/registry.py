@@ -245,6 +245,7 @@ BENCHMARKS = (
         timed=True,
         reduced_timed=False,
     ),
+    Benchmark("laboratory.supports", "bridges whose recorded supports move apart: named", "20 min", "30 s"),
     Benchmark(
         "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "10 min", "15 s"
     ),

@@ -14,7 +14,8 @@ import numpy as np
 Kind = Literal[
     # Mistakes in records, or in what is stated of them; the first of them explains what else speaks against a fit.
     "conjugated spectra", "late sensor", "relative responses", "positions", "unit", "sign", "swapped sensors", "gain",
-    "table rocks", "soft bracket", "force sign", "force unit", "frequencies in rad/s", "short segments",
+    "supports differ", "table rocks", "soft bracket", "force sign", "force unit", "frequencies in rad/s",
+    "short segments",
     # Damaged samples that are left in the records, or were left out.
     "clipped", "dropout", "held value", "spikes", "tone", "equal channels",
     # What speaks against a fit.

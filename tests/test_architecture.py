@@ -59,8 +59,14 @@ CEILINGS = {
     # sensors of other files (159),
     # and delays of many periods looked for in any case, gains beside what a model misses, and threads of pools that
     # were dropped (40),
-    # and modes that follow their amplitude: the law, its motion in time with derivatives, its fit, its checks (900).
-    "lines": 48_477,  # 67 for dampers between modes in the band and those above it
+    # and modes that follow their amplitude: the law, its motion in time with derivatives, its fit, its checks (900);
+    # its export at a level, its exponents from laws that say the same, the likeliest so far where it is stopped (70),
+    # and delays, noise over the lines and modes above them beside errors that grow with the signal (95),
+    # and what Hann's window makes of the poles of functions H1, in closed form, taken off (95),
+    # and supports that move apart (15),
+    # and steady tones, found beside the motion of the base in whole records, fitted and told, and drift (190),
+    # and dampers between modes in the band and those above it (70).
+    "lines": 48_950,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 194,
     # What was counted when these counts began; the modes once, in the open, brings them down.

@@ -161,3 +161,16 @@ def test_errors_have_the_covariance_of_all_channels():
     found = e @ e.conj().T / draws
     scale = np.sqrt(np.outer(np.diag(S), np.diag(S)).real)
     assert np.abs((found - S) / scale).max() < 5 / np.sqrt(draws)
+
+
+def test_matrices_at_a_level_move_one_mode_alone():
+    w, zeta, k = 0.9 * W[1], 0.05, 1
+    shape = np.outer(P[k], P[k])  # M phi phi' M
+    np.testing.assert_allclose(shape, M_SS @ np.outer(PHI[:, k], PHI[:, k]) @ M_SS, rtol=1e-9)
+    K_A, C_A = K_SS - (W[k] ** 2 - w**2) * shape, C + 2 * (zeta * w - RATIOS[k] * W[k]) * shape
+    poles = np.linalg.eigvals(
+        np.block([[np.zeros((N, N)), np.eye(N)], [-np.linalg.solve(M_SS, np.hstack([K_A, C_A]))]])
+    )
+    omega, ratios = (np.where(np.arange(N) == k, new, old) for new, old in ((w, W), (zeta, RATIOS)))
+    expected = omega * (-ratios + 1j * np.sqrt(1 - ratios**2))
+    np.testing.assert_allclose(np.sort_complex(poles[poles.imag > 0]), np.sort_complex(expected), rtol=1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,8 +16,10 @@ from scipy.interpolate import CubicSpline
 import sysid
 
 Array = NDArray[np.floating[Any]]
-Kind = Literal["linear", "law", "duffing", "friction"]
+Kind = Literal["linear", "law", "duffing", "friction", "bilinear", "bouc-wen"]
 RATE, BAND = 50.0, (0.5, 18.0)  # Hz
+LEVELS = (0.3, 1.0, 3.0)  # m/s² rms of the base
+YIELDING = {"bouc-wen": 1, "bilinear": 16}  # Bouc and Wen's exponent: large, the spring is elastic, then plastic
 FALL, RISE = 0.06, 0.012  # of a stated law, at the level AT, m/s²
 AT = 12.0
 
@@ -26,8 +28,9 @@ AT = 12.0
 class Storeys:
     """A chain of storeys on a base that moves, with one effect that is not linear.
 
-    `stiffness` (n,) of each storey, N/m, and masses (n,), kg; `ratios` (n,) of the modes at rest; `size` is of the
-    effect, which is the storeys' cubic stiffness, 1/m², or the friction of each, N.
+    `stiffness` (n,) of each storey at rest, N/m, and masses (n,), kg; `ratios` (n,) of the modes at rest; `size` is of
+    the effect: the storeys' cubic stiffness over their own, 1/m², friction over stiffness, m, or the drift at which a
+    fifth of the stiffness yields, m.
     """
 
     kind: Kind
@@ -48,49 +51,60 @@ class Storeys:
         lam, phi = scipy.linalg.eigh(self.K, np.diag(self.mass))
         return np.sqrt(lam), phi
 
-    def under(self, base: Array) -> Array:
-        """Absolute accelerations (n, N) under a base acceleration (N,), from rest."""
-        fine = scipy.signal.resample(base, 8 * base.size)
-        t, u = np.arange(base.size) / RATE, CubicSpline(np.arange(fine.size) / (8 * RATE), fine)
+    def drift(self, level: float) -> float:
+        """The largest rms drift of a storey, m, without the effect, under a base of a level, m/s² rms, as `shaken`."""
+        w, phi = self.modes
+        omega = 2 * np.pi * np.linspace(*BAND, 4000)
+        q = (phi.T @ self.mass)[:, None] / (w[:, None] ** 2 - omega**2 + 2j * (self.ratios * w)[:, None] * omega)
+        return float(level * np.sqrt(np.mean(np.abs(np.diff(phi @ q, axis=0, prepend=0.0)) ** 2, axis=1).max()))
+
+    def under(self, bases: Array) -> Array:
+        """Absolute accelerations (r, n, N) under base accelerations (r, N) of runs, from rest, all in one system."""
+        fine = scipy.signal.resample(bases, 8 * bases.shape[1], axis=1)
+        t, u = np.arange(bases.shape[1]) / RATE, CubicSpline(np.arange(fine.shape[1]) / (8 * RATE), fine, axis=1)
         slope = self._modal_slope() if self.kind == "law" else self._slope()
-        n = self.mass.size
+        n, r = self.mass.size, len(bases)
+        shape = (2 * n + n * (self.kind in YIELDING), r)
         motion = solve_ivp(
-            lambda at, y: slope(y, float(u(at))), (0, t[-1]), np.zeros(2 * n), t_eval=t, rtol=1e-9, atol=1e-11,
-            max_step=1 / RATE,
+            lambda at, y: slope(y.reshape(shape), u(at)).ravel(), (0, t[-1]), np.zeros(shape[0] * r), method="DOP853",
+            t_eval=t, rtol=1e-9, atol=1e-11, max_step=1 / RATE,
         )  # fmt: skip
-        relative = np.array([slope(y, now)[n:] for y, now in zip(motion.y.T, base, strict=True)]).T
-        return (self.modes[1] @ relative if self.kind == "law" else relative) + base
+        accelerations = [slope(y.reshape(shape), now)[n : 2 * n].T for y, now in zip(motion.y.T, bases.T, strict=True)]
+        relative = np.stack(accelerations, axis=-1)
+        return np.asarray((self.modes[1] @ relative if self.kind == "law" else relative) + bases[:, None])
 
-    def _slope(self) -> Callable[[Array, float], Array]:
-        (w, phi), M = self.modes, np.diag(self.mass)
-        C, n = M @ phi @ np.diag(2 * self.ratios * w) @ phi.T @ M, self.mass.size
+    def _slope(self) -> Callable[[Array, Array], Array]:
+        """Of displacements, velocities and, where springs yield, their drifts, all (n, r)."""
+        (w, phi), M, n, k = self.modes, np.diag(self.mass), self.mass.size, self.stiffness[:, None]
+        loss = phi @ np.diag(2 * self.ratios * w) @ phi.T @ M
+        drifts = np.eye(n) - np.eye(n, k=-1)
+        by_force, sharp = drifts.T / self.mass[:, None], YIELDING.get(self.kind, 0)
 
-        def storeys(drift: Array, speed: Array) -> Array:
-            force = self.stiffness * drift
+        def slope(y: Array, u: Array) -> Array:
+            x, v = drifts @ y[:n], drifts @ y[n : 2 * n]
+            force, slip = k * x, y[2 * n :]
             if self.kind == "duffing":
-                force = force + self.size * self.stiffness * drift**3
+                force = force + self.size * k * x**3
             if self.kind == "friction":
-                force = force + self.size * np.tanh(speed / 2e-3)
-            return force
-
-        def slope(y: Array, u: float) -> Array:
-            x, v = y[:n], y[n:]
-            force = storeys(np.diff(x, prepend=0.0), np.diff(v, prepend=0.0))
-            return np.append(v, -u - (C @ v + force - np.append(force[1:], 0.0)) / self.mass)
+                force = force + self.size * k * np.tanh(v / 2e-3)
+            if sharp:
+                force = k * (0.8 * x + 0.2 * slip)
+                slip = v * (1 - np.minimum(np.abs(slip / self.size), 1.5) ** sharp * (v * slip > 0))
+            return np.concatenate([y[n : 2 * n], -u - loss @ y[n : 2 * n] - by_force @ force, slip])
 
         return slope
 
-    def _modal_slope(self) -> Callable[[Array, float], Array]:
+    def _modal_slope(self) -> Callable[[Array, Array], Array]:
         w, phi = self.modes
-        load, n, size = phi.T @ self.mass, self.mass.size, np.abs(phi[:, 0]).max()
+        load, n, size = (phi.T @ self.mass)[:, None], self.mass.size, np.abs(phi[:, 0]).max()
 
-        def slope(y: Array, u: float) -> Array:
-            q, v, now, zeta, level = y[:n], y[n:], w.copy(), self.ratios.copy(), 0.0
-            for _ in range(12):
-                level = size * now[0] * np.hypot(now[0] * q[0], v[0]) / AT
-                now[0] = w[0] * (1 - FALL * np.sqrt(level))
-            zeta[0] += RISE * level
-            return np.append(v, -2 * zeta * now * v - now**2 * q - load * u)
+        def slope(y: Array, u: Array) -> Array:
+            q, v = y[:n], y[n:]
+            now, zeta, level = (np.tile(one[:, None], u.size) for one in (w, self.ratios, 0 * w))
+            for _ in range(7):  # each brings it nearer by a factor of thirty
+                level[0] = size * now[0] * np.hypot(now[0] * q[0], v[0]) / AT
+                now[0] = w[0] * (1 - FALL * np.sqrt(level[0]))
+            return np.concatenate([v, -2 * (zeta + RISE * level) * now * v - now**2 * q - load * u])
 
         return slope
 
@@ -99,8 +113,11 @@ def storeys(kind: Kind, rng: np.random.Generator, n: int) -> Storeys:
     """Storeys drawn about equal ones, the first mode at 3 Hz."""
     mass, stiffness, ratios = rng.uniform(0.8, 1.2, n), rng.uniform(0.8, 1.2, n), rng.uniform(0.008, 0.02, n)
     first = Storeys(kind, mass, stiffness, ratios, 0.0)
-    stiffness = stiffness * (2 * np.pi * 3.0 / first.modes[0][0]) ** 2
-    return Storeys(kind, mass, stiffness, ratios, {"duffing": -2000.0, "friction": 0.05}.get(kind, 0.0))
+    linear = replace(first, stiffness=stiffness * (2 * np.pi * 3.0 / first.modes[0][0]) ** 2)
+    drift = linear.drift(LEVELS[-1])
+    hard = rng.random() < 0.5
+    sizes = {"duffing": (0.05 if hard else -0.015) / drift**2, "friction": 0.004 * drift}
+    return replace(linear, size=sizes.get(kind, 0.7 * drift))
 
 
 def shaken(level: float, seconds: float, rng: np.random.Generator) -> Array:

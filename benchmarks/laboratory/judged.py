@@ -33,21 +33,21 @@ def figures(kind: str, draw: int) -> dict[str, Any]:
             case = KINDS[kind](rng, folder)
         (folder / "list.toml").write_text(case.sensors, encoding="utf-8")
         files = [str(path) for path in case.files]
-        read, _ = _command("read", *files, "--sensors", str(folder / "list.toml"), "--out", str(folder / "test.h5"))
+        read, _ = command("read", *files, "--sensors", str(folder / "list.toml"), "--out", str(folder / "test.h5"))
         true = case.rig.frequencies[: case.rig.count].tolist()
         told = {"kind": kind, "draw": draw, "what": case.rig.name, "end": case.rig.end, "true": true}
         if read.returncode:
-            return told | {"refused": _line(read)}
+            return told | {"refused": last_line(read)}
         asked = ["run", str(folder / "test.h5"), "--gain-std", TOLERANCE, *case.options, "--out", str(folder / "out")]
-        run, seconds = _command(*asked)
+        run, seconds = command(*asked)
         told |= {"seconds": seconds, "read": read.stdout}
         if run.returncode not in (0, 1):
-            return told | {"refused": _line(run)}
+            return told | {"refused": last_line(run)}
         result = sysid.load(folder / "out" / "result.h5")
         return told | _beside(result, case)
 
 
-def _command(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float]:
+def command(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float]:
     """``sysid ARGUMENTS`` in a process of its own, and the seconds of processor time that it takes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, "-m", "sysid", *arguments], capture_output=True, text=True, check=False)
@@ -55,7 +55,8 @@ def _command(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float]:
     return done, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def _line(done: subprocess.CompletedProcess[str]) -> str:
+def last_line(done: subprocess.CompletedProcess[str]) -> str:
+    """What a command said last."""
     return (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
 
 
@@ -73,7 +74,7 @@ def _beside(result: sysid.Identification, case: Case) -> dict[str, Any]:
     counted = bool(np.isin(must, at).all() and np.isin(np.flatnonzero((f >= low) & (f <= high)), mine).all())
     told: dict[str, Any] = {
         "word": result.judgement, "right": result.judgement == case.word, "counted": counted, "found": f.tolist(),
-        "accused": [f"{one.kind}: {one.channel or one.sentence[:60]}" for one in result.findings if _accuses(one)],
+        "accused": [f"{one.kind}: {one.channel or one.sentence[:60]}" for one in result.findings if accuses(one)],
         "against": [f"{one.severity} {one.kind} {one.channel or ''}: {one.sentence[:160]}" for one in result.findings
                     if one.severity != "note"],
         "notes": [f"{one.kind} {one.channel or ''}" for one in result.findings if one.severity == "note"],
@@ -89,7 +90,7 @@ def _beside(result: sysid.Identification, case: Case) -> dict[str, Any]:
     return told
 
 
-def _accuses(one: sysid.Finding) -> bool:
+def accuses(one: sysid.Finding) -> bool:
     """True of a finding that speaks against a record or a stated mass, which are all right but for clocks and hum."""
     heavy = one.severity in ("blocking", "contradicts", "caution")
     of_record = one.channel is not None or one.kind in MISTAKES | OF_MASS

@@ -199,7 +199,7 @@ def _export(options: argparse.Namespace, out: Output) -> int:
     target = Path(options.file)
     form = formats.format_of(target)  # a wrong ending is told before the result is read
     result = requests.read_result(options, out)
-    out.wrote(formats.export(result, target, positive_axes=options.positive_axes))
+    out.wrote(formats.export(result, target, positive_axes=options.positive_axes, level=options.level))
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
     precision = formats.precision(target)
     out.write(f"{form.name}; precision: {precision}{without}\n")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -39,24 +39,30 @@ class Content:
         Whose rows are along `sensors`.
     sensors : tuple of Sensor or None
         None where they are not described.
+    level : float or None
+        m/s², at which the modes that follow their amplitude move; None at rest.
     """
 
     it: Identification
     structure: Structure
     sensors: tuple[Sensor, ...] | None
+    level: float | None = None
 
     @classmethod
-    def of(cls, it: Identification, positive_axes: bool = False) -> Content:
-        """The content of a result, all its sensors along +x, +y, +z, +rx, ... where `positive_axes`."""
+    def of(cls, it: Identification, positive_axes: bool = False, level: float | None = None) -> Content:
+        """The content of a result, at a level, all its sensors along +x, +y, +z, +rx, ... where `positive_axes`."""
+        linear = "no mode of this result follows its amplitude, its matrices hold at all levels (sysid run --amplitude)"
+        refuse((level is not None and not it.structure.laws, f"level: {linear}"))
+        structure = it.structure if level is None else it.structure.at_level(level)
         if not positive_axes:
-            return cls(it, it.structure, it.measurement.sensors)
+            return cls(it, structure, it.measurement.sensors, level)
         sensors = it.measurement.sensors or ()
         undescribed = "the axes of the sensors are not known: describe them (sensors=[sysid.Sensor(...)])"
         refuse((not sensors, f"positive axes: {undescribed}"))
         signs = np.array([-1.0 if _negative(sensor) else 1.0 for sensor in sensors])
         described = zip(sensors, signs, strict=True)
         turned = tuple(replace(one, axis=_positive(one)) if sign < 0 else one for one, sign in described)
-        return cls(it, _turned(it.structure, signs, turned), turned)
+        return cls(it, _turned(structure, signs, turned), turned, level)
 
     @property
     def base_axes(self) -> tuple[str, ...]:
@@ -168,6 +174,7 @@ def statements(content: Content, precision: str) -> tuple[str, ...]:
         _directions(content),
         "damping acts on the motion relative to the base",
         f"precision: {precision}",
+        *_level_in_words(content),
     ]
     if structure.residual.count:
         f = ", ".join(f"{one:.6g}" for one in structure.residual.natural_frequencies)
@@ -178,6 +185,22 @@ def statements(content: Content, precision: str) -> tuple[str, ...]:
     if it.facts.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
     return tuple(shown_plainly(" ".join(text.split())) for text in found)
+
+
+def _level_in_words(content: Content) -> Iterator[str]:
+    """The level of the matrices, where modes follow their amplitude, law by law."""
+    it, level = content.it, content.level
+    for law in it.structure.laws:
+        mode, low, high = it.structure.mode_of(law) + 1, *law.levels
+        frequency, ratio = law.at(level or 0.0)
+        where = f"at {level:.6g} m/s2" if level is not None else "at rest"
+        beyond = level is not None and not low <= level <= high
+        yield (
+            f"level: mode {mode} follows its amplitude; these matrices are those {where} of its relative acceleration "
+            f"at {it.measurement.sensor_names[law.sensor]} ({frequency:.6g} Hz, damping ratio {ratio:.4g}); it was "
+            f"tested from {low:.3g} to {high:.3g} m/s2{', so that they are extrapolated' * beyond}; deviations are "
+            "those at rest"
+        )
 
 
 def _directions(content: Content) -> str:

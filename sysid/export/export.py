@@ -46,7 +46,9 @@ FORMATS = {
 }
 
 
-def export(identification: Identification, path: str | Path, *, positive_axes: bool = False) -> Path:
+def export(
+    identification: Identification, path: str | Path, *, positive_axes: bool = False, level: float | None = None
+) -> Path:  # fmt: skip
     """Write an identified structure for another program; the ending of the file tells the format.
 
     Parameters
@@ -64,6 +66,8 @@ def export(identification: Identification, path: str | Path, *, positive_axes: b
     positive_axes : bool
         Whether rows of sensors along -x, -y or -z are turned to +x, +y, +z. By default they stay as recorded; names of
         rows tell the axis: "floor 2 (-x)". Mode shapes in universal files are along x, y, z in any case.
+    level : float, optional
+        m/s², at which modes that follow their amplitude move: see `Structure.at_level`. By default at rest.
 
     Returns
     -------
@@ -73,7 +77,8 @@ def export(identification: Identification, path: str | Path, *, positive_axes: b
     Raises
     ------
     InputError
-        Where the ending is none of these, a package is missing, or the file cannot be written.
+        Where the ending is none of these, a package is missing, or the file cannot be written; where no mode follows
+        its amplitude at a stated level.
 
     Notes
     -----
@@ -86,7 +91,7 @@ def export(identification: Identification, path: str | Path, *, positive_axes: b
     chosen = format_of(target)
     if chosen.needs:
         needed(chosen.needs, chosen.extra, f"{target}: a {chosen.name}")
-    content = Content.of(identification, flag("positive_axes", positive_axes))
+    content = Content.of(identification, flag("positive_axes", positive_axes), level)
     with atomically(target) as temporary:
         chosen.write(content, statements(content, chosen.precision), temporary)
     return target

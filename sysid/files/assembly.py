@@ -301,10 +301,11 @@ def base_differences(
     taken = motions(base, said, axes) @ _base_motion(base, said, axes, place)
     sizes, off = (np.linalg.norm(one, axis=1) for one in (values, values - taken))
     words = f"{place}: {len(base)} base sensors along {' '.join(axes)}"
-    apart = "share less than half of what they record: mend a sign (axis), a unit or a gain, or state how"
+    apart = "share less than half of what they record: mend a sign (axis), a unit or a gain; state how"
     names = ", ".join(repr(one.name) for one, _ in base)
     wrong = np.linalg.norm(off) > 0.5 * np.linalg.norm(sizes)
-    refuse((wrong, f'{words} ({names}) {apart} else the base moves, such as base_axes = "x rz"'))
+    other = 'else the base moves, such as base_axes = "x rz"; or keep one alone of supports that move for themselves'
+    refuse((wrong, f"{words} ({names}) {apart} {other}"))
     gains = [float(np.real(np.vdot(b, a) / np.vdot(b, b))) for a, b in zip(values, taken, strict=True)]
     shares = zip(base, gains, off / sizes, strict=True)
     return tuple(BaseSensor(one.name, gain, float(share)) for (one, _), gain, share in shares)

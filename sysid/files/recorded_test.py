@@ -75,6 +75,8 @@ class RecordedTest:
         Standard deviations of spectra, by the coherences of their files.
     averaged : bool
         Whether spectra are averages over segments under a window.
+    window : str
+        See `Measurement`.
     """
 
     runs: tuple[Run, ...]
@@ -91,11 +93,19 @@ class RecordedTest:
     response_std: Array | None = None
     force_std: Array | None = None
     averaged: bool = False
+    window: str = ""
 
     @property
     def excited_band(self) -> tuple[float, float] | None:
-        """The band that the base excites, Hz (`sysid.excited_band`); None of spectra."""
-        return None if self.sample_rate is None else excited_band(self.runs, self.sample_rate)
+        """The band that the base excites, Hz (`sysid.excited_band`); None of spectra.
+
+        From four periods a record on, as drift of up to two leaks into the lines below.
+        """
+        if self.sample_rate is None:
+            return None
+        low, high = excited_band(self.runs, self.sample_rate)
+        longest = max(base.shape[1] for base, *_ in self.runs)
+        return min(max(low, 3.999 * self.sample_rate / longest), high), high
 
     @property
     def damage(self) -> list[DamagedChannel]:
@@ -125,7 +135,8 @@ class RecordedTest:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
         parts: Any = zip(*self.runs, strict=True)
         base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
-        given |= dict(response_std=self.response_std, force_std=self.force_std, averaged=self.averaged)
+        given |= dict(response_std=self.response_std, force_std=self.force_std)
+        given |= dict(averaged=self.averaged, window=self.window)
         test = Measurement(self.freq, base, response, force=force, **given, **tolerances)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
@@ -167,6 +178,7 @@ class RecordedTest:
                 "base_sensors": [one._asdict() for one in self.base_sensors],
                 "std": {"response": self.response_std, "force": self.force_std},
                 "averaged": self.averaged,
+                "window": self.window,
             },
             _FORMAT,
         )
@@ -181,7 +193,7 @@ class RecordedTest:
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]), tree.get("base_gain_std"),
             tree.get("force_gain_std"), tuple(BaseSensor(**one) for one in tree.get("base_sensors", ())),
-            std.get("response"), std.get("force"), tree.get("averaged", False),
+            std.get("response"), std.get("force"), tree.get("averaged", False), tree.get("window", ""),
         )  # fmt: skip
         test._check()
         return test

@@ -91,7 +91,7 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
     remarks += [*delays_in_words(said), *work_of_force(runs, freq), *words, how]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks),
-        **tolerances_of(said, axes), **std, averaged=said.window != "" or said.averages > 0,
+        **tolerances_of(said, axes), **std, averaged=said.window != "" or said.averages > 0, window=said.window,
     )  # fmt: skip
 
 
@@ -113,16 +113,15 @@ def _deviations(
     if unused:
         given = any(one.coherence is not None for one in every)
         return none, [f"coherences stand in the files and are not used: {unused[0]}"] * given
-    hann = said.window == "hann"
     response, force = [], []
     for run in parts:
-        std = {one.channel: std_of_functions(one.values, one.coherence, said.averages, hann=hann) for one in run}
+        std = {one.channel: std_of_functions(one.values, one.coherence, said.averages) for one in run}
         named = {channel.name: values for channel, values in std.items() if channel.role == "response"}
         response.append(np.array([named[sensor.name] for sensor in sensors_of(said)]))
         cells = [(channel, values) for channel, values in std.items() if channel.role == "force"]
         if cells:
             force.append(np.sqrt(motions(cells, said, axes).T ** 2 @ np.array([values**2 for _, values in cells])))
-    words = f"noise by the coherences of {said.averages} averages{', and by what the window blurs' * hann}"
+    words = f"noise by the coherences of {said.averages} averages"
     return {"response_std": np.array(response), "force_std": np.array(force) if force else None}, [words]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.measurement.spectra import FOLDED, lines_of_record, runs_of_records
@@ -77,7 +78,7 @@ def _band_of(base: Array, sample_rate: float) -> tuple[float, float]:
     """The band of one run (d, n)."""
     freq = lines_of_record(base.shape[1]) * sample_rate
     freq = freq[: max(np.searchsorted(freq, FOLDED * sample_rate, side="right"), 1)]
-    power = _density(base)[1 : 1 + freq.size]
+    power = _without_hum(_density(base))[1 : 1 + freq.size]
     if not np.any(power):
         return float(freq[0]), float(freq[-1])
     levels = _levels(freq, power)
@@ -105,6 +106,20 @@ def _density(base: Array, tapers: int = 5) -> Array:
     centred, at = base - base.mean(axis=1, keepdims=True), np.pi * np.arange(1, n + 1) / (n + 1)
     parts = (np.fft.rfft(np.sin(k * at) * centred, axis=1) for k in range(1, tapers + 1))
     return sum((np.sum(np.abs(part) ** 2, axis=0) for part in parts), np.zeros(n // 2 + 1))
+
+
+def _without_hum(power: Array, little: float = 1e-5, out: float = 30.0, near: int = 8, about: int = 17) -> Array:
+    """A power density without lines that stand out of those on both sides and hold next to nothing of the power.
+
+    The mains leave such lines where the base does not move; a step of a sine holds more.
+    """
+    shift = near + about // 2
+    if power.size < 4 * shift:
+        return power
+    median = scipy.ndimage.median_filter(np.pad(power, shift, mode="reflect"), about)
+    beside = np.maximum(median[: power.size], median[2 * shift :])
+    hum = (power > out * beside) & (np.convolve(power, np.ones(near), "same") < little * power.sum())
+    return np.where(np.convolve(hum, np.ones(near + 1), "same") > 0, np.minimum(power, beside), power)
 
 
 def _levels(freq: Array, power: Array, fewest: int = 6) -> _Levels:

@@ -22,6 +22,7 @@ from sysid.errors import (
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
 from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present
+from sysid.measurement.steady_tones import with_steady_tones
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, levels_at_rest, whole_of
 from sysid.structure.sensor import (
     BASE_AXES,
@@ -70,6 +71,8 @@ class Measurement:
         What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
     averaged : bool
         Averages over segments, as "h1" and "h2" of `from_time` give: their window flattens narrow peaks.
+    window : str
+        "hann" of functions H1 under that window, "taken off" without what it makes of their poles, "" of all else.
     whole : WholeRecords, optional
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
     sample_rate : float, optional
@@ -101,6 +104,7 @@ class Measurement:
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
     averaged: bool = field(default=False, kw_only=True)
+    window: str = field(default="", kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     sample_rate: float | None = field(default=None, kw_only=True)
     gain_std: Array | None = field(default=None, kw_only=True)
@@ -166,7 +170,7 @@ class Measurement:
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
             "force_std": self.force_std, "base_axes": self.base_axes,
             "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
-            "averaged": self.averaged, "whole": self.whole and self.whole.to_tree(),
+            "averaged": self.averaged, "window": self.window, "whole": self.whole and self.whole.to_tree(),
             "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
             "force_gain_std": self.force_gain_std,
             "damage": [one.to_tree() for one in self.damage],
@@ -359,8 +363,7 @@ class Measurement:
             Of functions H1 that an analyser averaged: its window, and how many independent blocks.
         coherence, force_coherence : array_like, optional
             Coherences of `frf` and `force`, broadcast to them, which tell their deviations by `averages`:
-            ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9), and what the
-            window blurs.
+            ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9).
         rigid_body, sensors, base_axes, missing
             As in `Measurement`.
         """
@@ -380,7 +383,7 @@ class Measurement:
             if known is not None and function is not None:
                 seen = spectra.coherence_of(name, known, function.shape)
                 count = whole_number("averages", averages, at_least=2)
-                std = spectra.std_of_functions(function, seen, count, hann=window == "hann")
+                std = spectra.std_of_functions(function, seen, count)
                 response_std, force_std = (std, force_std) if function is H else (response_std, std)
         given = (
             H,
@@ -393,7 +396,7 @@ class Measurement:
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
         return cls(
             lines, unit_runs(d, lines.size), by_run[0], force=by_run[1], response_std=by_run[2], force_std=by_run[3],
-            averaged=window != "" or stated, **options,
+            averaged=window != "" or stated, window=window, **options,
         )  # fmt: skip
 
     @classmethod
@@ -479,7 +482,10 @@ class Measurement:
             test = replace(test, averaged=True, damage=sound.damage)
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
-        return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+        test = test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+        parts = tuple(getattr(test, name) for name in _RECORDS[1:4] if getattr(test, name) is not None)
+        tones = test.whole and with_steady_tones(test.whole, test.freq, test.own_lines, *parts)
+        return replace(test, whole=tones)
 
     noise_from_rest = staticmethod(levels_at_rest)
 

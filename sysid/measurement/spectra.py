@@ -143,7 +143,7 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
 
     H1 solves ``S_yx = H S_xx`` for all base directions together; H2 is ``S_yy / S_xy``, for one base direction. The
     variance of an estimate from n_e effective averages is ``(1 - coherence) S_yy [S_xx^-1]_ii / n_e`` (Bendat and
-    Piersol, *Random Data*, ch. 9), n_e counting the overlap as in Welch (1967). What the window blurs (`_smoothing`) is
+    Piersol, *Random Data*, ch. 9), n_e counting the overlap as in Welch (1967). What the window blurs (`blurred`) is
     added. Refused where there are too few segments, or base directions are not independent.
     """
     from scipy import signal
@@ -182,7 +182,7 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
     coherence = np.clip(explained / np.where(S_yy > 0, S_yy, np.inf), 0.0, 1.0)
     # The residual spectrum has averages - d degrees of freedom left.
     variance = ((1 - coherence) * S_yy)[:, :, None] * np.einsum("fii->fi", inverse).real[:, None, :] / (averages - d)
-    std = np.sqrt(variance + _smoothing(H) ** 2)
+    std = np.sqrt(variance + blurred(H.T).T ** 2)
     if kind == "h2":
         ratio = 1 / np.maximum(coherence, np.finfo(float).tiny)[:, :, None]  # H2 = H1 / coherence
         H, std = H * ratio, std * ratio
@@ -199,15 +199,14 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
     )
 
 
-def std_of_functions(H: ComplexArray, coherence: Array, averages: int, *, hann: bool = False) -> Array:
+def std_of_functions(H: ComplexArray, coherence: Array, averages: int) -> Array:
     """Standard deviations ``sqrt(E|e|²)`` of functions H1 (..., lines) by their coherences and independent averages.
 
-    ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9), and what Hann's window
-    blurs. Coherences are those of text files: above one less 1e-6 they are not told apart.
+    ``|H|² (1 - coherence) / (coherence averages)`` (Bendat and Piersol, *Random Data*, ch. 9). Coherences are those of
+    text files: above one less 1e-6 they are not told apart.
     """
     known = np.clip(coherence, 1e-6, 1 - 1e-6)
-    blurred = np.moveaxis(_smoothing(np.moveaxis(H, -1, 0)), 0, -1) if hann else 0.0
-    std: Array = np.sqrt(np.abs(H) ** 2 * (1 - known) / (known * averages) + blurred**2)
+    std: Array = np.sqrt(np.abs(H) ** 2 * (1 - known) / (known * averages))
     return std
 
 
@@ -349,14 +348,14 @@ def _record(name: str, value: ArrayLike, channels: int) -> Array:
     return shaped_array(name, np.atleast_2d(finite_array(name, value)), channels, "n_samples")
 
 
-def _smoothing(H: ComplexArray) -> Array:
-    """Error of lines that the window blurs, ``h² |H''| / 6`` for Hann's, h the distance of lines; (n_freq, ...).
+def blurred(H: ComplexArray) -> Array:
+    """Error of lines that the window blurs, ``h² |H''| / 6`` for Hann's, h the distance of lines; (..., n_freq).
 
     An average over the window's squared spectrum, whose second moment is h²/3. No average over segments lowers it and
     no coherence of exact records shows it, so beside sharp peaks it is most of what an estimate is off by.
     """
     bend = np.zeros(H.shape)
-    bend[1:-1] = np.abs(np.diff(H, 2, axis=0)) / 6
+    bend[..., 1:-1] = np.abs(np.diff(H, 2)) / 6
     return bend
 
 

@@ -88,7 +88,7 @@ class WholeRecords:
     is found to vary over the lines; `taken`, (n_sensors [+ 1],), s, are delays that were taken off sensors and force:
     at one of its ends such a record holds what is not its own. `plain` tells that squares are fitted, the base's motion
     as recorded, and `grows` that the noise of each channel holds a share of its signal. All four are set by the fit, in
-    no file.
+    no file. `tones` are frequencies of steady sines, Hz, of which each channel and run holds one.
     """
 
     samples: tuple[int, ...]
@@ -99,11 +99,12 @@ class WholeRecords:
     taken: Array | None = field(default=None)
     plain: bool = field(default=False)
     grows: bool = field(default=False)
+    tones: tuple[float, ...] = field(default=())
 
     @property
     def of_sampling(self) -> int:
-        """Real numbers of each channel and run that sampling and detrending leave: of 1, i w and 1 / (i w)."""
-        return 3
+        """Real numbers of each channel and run of 1, i w, 1 / (i w), by sampling and detrending, and two a tone."""
+        return 3 + 2 * len(self.tones)
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -141,6 +142,10 @@ class WholeRecords:
         taken = delays if self.taken is None else self.taken + delays
         return replace(self, taken=taken if np.any(taken) else None)
 
+    def profile_at(self, lines: NDArray[np.bool_]) -> Array | float:
+        """Noise at lines, (n_freq,), over its level: alike at all."""
+        return 1.0
+
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
 
@@ -168,11 +173,30 @@ class WholeRecords:
     def traces(self, freq: Array, last: float) -> ComplexArray:
         """Spectra at lines in Hz of which a channel of a run holds multiples beside its response, (3 + k, n).
 
-        Those of sampling, 1, i w and 1 / (i w), for lines up to `last`, Hz, and then those of the `pulses`.
+        Those of sampling, 1, i w and 1 / (i w), for lines up to `last`, Hz, of tones, and then those of the `pulses`.
         """
         unit = freq / last
         plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])[: self.of_sampling]
-        return np.concatenate([plain, np.exp(2j * np.pi * self.pulses(last)[0][:, None] * freq)])
+        return np.concatenate(
+            [
+                plain,
+                *map(self.of_tone, self.tones, [freq] * len(self.tones)),
+                np.exp(2j * np.pi * self.pulses(last)[0][:, None] * freq),
+            ]
+        )
+
+    def of_tone(self, tone: float, freq: Array) -> ComplexArray:
+        """Spectra at lines in Hz, (2, n), of whose real multiples that of any steady sine of `tone` Hz is made, and 1.
+
+        At a line, where ``exp(i w T)`` is one, the sum of ``exp(i (v - w) t)`` over the samples of a record is a number
+        of the record over ``exp(i (v - w) dt) - 1``, so that of a sine is a real combination of
+        ``i sin(w dt) / (cos(w dt) - cos(v dt))``, ``sin(v dt)`` over the same, and 1.
+        """
+        w, v = 2 * np.pi * freq / self.sample_rate, 2 * np.pi * tone / self.sample_rate
+        half = np.sin((v - w) / 2)  # of a tone at a line this is a spectrum of that line alone
+        half = np.where(np.abs(half) < 1e-11, 1e-11, half)
+        over = 2 * half * np.sin((v + w) / 2)
+        return np.stack([1j * np.sin(w) / over, np.sin(v) / over + 0j])
 
     def to_tree(self) -> dict[str, Any]:
         """Give it as dictionaries and arrays; `from_tree` takes it back."""
@@ -181,6 +205,7 @@ class WholeRecords:
             "sample_rate": self.sample_rate,
             "at_rest": np.array(self.at_rest),
             "noise": self.noise and dict(vars(self.noise)),
+            "tones": np.array(self.tones),
         }
 
     @classmethod
@@ -188,14 +213,20 @@ class WholeRecords:
         """Give what a tree of `to_tree` stands for."""
         noise = tree["noise"] and NoiseLevels(**tree["noise"])
         samples, rest = tuple(map(int, tree["samples"])), tuple(map(bool, tree["at_rest"]))
-        return cls(samples, float(tree["sample_rate"]), rest, noise)
+        tones = tuple(np.asarray(tree.get("tones", ())).tolist())
+        return cls(samples, float(tree["sample_rate"]), rest, noise, tones=tones)
 
 
+@dataclass(frozen=True, eq=False)
 class SteadyLines(WholeRecords):
     """Lines that stand for themselves, without transients, as stepped sines leave them, or an analyser.
 
-    `sample_rate` is their least distance, Hz; variances are those of the complex numbers themselves.
+    `sample_rate` is their least distance, Hz; variances are those of the complex numbers themselves. `profile`,
+    (n_freq,), is the noise of all channels that is no share of their signal, at each line over its level: a dwell of so
+    many cycles holds the more of it the shorter it is, and much at lines about that of the mains. The fit sets it.
     """
+
+    profile: Array | None = field(default=None)
 
     @classmethod
     def of(cls, runs: int, freq: Array, *, grows: bool = True) -> SteadyLines:
@@ -211,6 +242,10 @@ class SteadyLines(WholeRecords):
     def density(self) -> Array:
         """One each."""
         return np.ones(len(self.samples))
+
+    def profile_at(self, lines: NDArray[np.bool_]) -> Array | float:
+        """See `WholeRecords`."""
+        return 1.0 if self.profile is None else self.profile[lines]
 
     def pulses(self, last: float) -> tuple[Array, NDArray[np.bool_]]:
         """None: see `WholeRecords`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -13,7 +13,17 @@ from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
-from sysid.modal_analysis.record_fit import ROUGH, RecordFit, half_inverse, refitted, rough_levels, unit_diagonal
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    WHOLE,
+    Limits,
+    RecordFit,
+    half_inverse,
+    refitted,
+    rough_levels,
+    unit_diagonal,
+)
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array, ComplexArray
@@ -33,39 +43,48 @@ def with_laws(
     Raises
     ------
     InputError
-        Where there is no such mode, or dampers couple the modes.
+        Where there is no such mode.
     """
+    stages: list[tuple[RecordFit, RecordFit]] = []
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            return _with_laws(fit, stated, left_of, monitor, much, tries)
+            for stage in _stages(fit, stated, left_of, monitor, much, tries):
+                stages.append(stage)
     except (Stop, KeyboardInterrupt):
-        return replace(fit, stopped=True)
+        so_far = _judged(*stages[-1]) if stages else fit
+        likelier = any(law.likelier for law in so_far.parameters.laws)
+        return replace(so_far if likelier else fit, stopped=True)
+    return _judged(*stages[-1])
 
 
-def _with_laws(
+def _stages(
     fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], monitor: FitMonitor, much: float,
     tries: tuple[float, ...],
-) -> RecordFit:  # fmt: skip
-    p, whole = fit.parameters, fit.model.whole
-    if p.coupling is not None:
-        raise InputError(
-            "AmplitudeLaw: the records show modes that dampers couple, and a mode that follows its amplitude stands "
-            "alone here: leave amplitude out"
-        )
+) -> Iterator[tuple[RecordFit, RecordFit]]:  # fmt: skip
+    """The likeliest fit with laws so far, and the linear one that it is judged by, better from stage to stage."""
+    whole = fit.model.whole
     plain = left_of(fit) > much or whole.plain
     whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
     linear = replace(fit, test=replace(fit.test, whole=whole))
     if plain:
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
-    numbers = _modes_of(linear, stated)
+    numbers, alone = _modes_of(linear, stated), linear
+    if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
+        alone = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
     monitor.doing = "a law of amplitude"
-    best = _started(linear, numbers, first, tries, monitor)
+    limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
+    best = _started(alone, numbers, first, tries, limits, monitor)
+    yield best, linear
     if stated.exponents == "auto":
-        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], monitor)
-        best = _likeliest(best, "of_damping", OF_DAMPING[1:], monitor)
+        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], limits, monitor)
+        yield best, linear
+        best = _likeliest(best, "of_damping", OF_DAMPING[1:], limits, monitor)
+        yield best, linear
+    if plain:
+        best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
     if plain and left_of(best) < much:
         monitor.doing = "noise of all channels"
         noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
@@ -73,7 +92,7 @@ def _with_laws(
             refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
             for p in (_with_equivalents(best), linear.parameters)
         )
-    return _judged(best, linear)
+    yield best, linear
 
 
 def _judged(best: RecordFit, linear: RecordFit) -> RecordFit:
@@ -115,8 +134,9 @@ def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
 
 
 def _started(
-    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], monitor: FitMonitor
-) -> RecordFit:
+    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
+    monitor: FitMonitor,
+) -> RecordFit:  # fmt: skip
     """Laws of these exponents, from the better of some falls of the frequency."""
     p = linear.parameters
     found = []
@@ -132,22 +152,46 @@ def _started(
         found.append(
             refitted(linear, replace(p, modes=modes, ends=ends, laws=tuple(laws)), limits=ROUGH, monitor=monitor)
         )
+        if found[-1].settled:
+            break
     best = max(found, key=lambda one: one.likelihood)
-    return refitted(best, _with_equivalents(best), monitor=monitor)
+    return refitted(best, _with_equivalents(best), limits=limits, monitor=monitor)
 
 
 def _likeliest(
-    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], monitor: FitMonitor
-) -> RecordFit:
-    """The likeliest of a fit and of those with other exponents, from what its laws say at the highest level."""
+    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], limits: Limits,
+    monitor: FitMonitor,
+) -> RecordFit:  # fmt: skip
+    """The likeliest of a fit and of those with other exponents."""
     for exponent in exponents:
         monitor.doing = f"a law of amplitude, exponent {exponent:g} {which.replace('_', ' ')}"
-        p = _with_equivalents(best)
-        laws = tuple(law._replace(form=law.form._replace(**{which: exponent})) for law in p.laws)
-        found = refitted(best, replace(p, laws=laws), monitor=monitor)
+        found = refitted(best, _with_exponent(best, which, exponent), limits=limits, monitor=monitor)
         if found.likelihood > best.likelihood:
             best = found
     return best
+
+
+def _with_exponent(fit: RecordFit, which: Literal["of_frequency", "of_damping"], exponent: float) -> Parameters:
+    """The parameters with another exponent of the laws, which say what they said at two levels.
+
+    One is exceeded most of the time, one hardly ever: from other values damping may be zero at all low levels, where
+    no step shows.
+    """
+    p, laws = _with_equivalents(fit), []
+    omega, ratios = p.modes.omega.copy(), p.modes.ratios.copy()
+    for law in p.laws:
+        unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
+        number, values, pole = ("of_frequency", "of_damping").index(which), law.values.copy(), [1.0, 1.0]
+        before, after = unit ** getattr(law.form, which), unit**exponent
+        values[number] *= (before[1] - before[0]) / (after[1] - after[0])
+        beside = law.values[number] * before[1] - values[number] * after[1]  # what is left is of any level
+        pole[number] = max(1 + beside / ratios[law.mode], 0.1) if number else 1 - beside
+        values[0] /= pole[0]
+        omega[law.mode] *= pole[0]
+        ratios[law.mode] *= pole[1]
+        form = law.form._replace(**{which: exponent})
+        laws.append(law._replace(form=form, values=values, equivalent=law.equivalent / pole))
+    return replace(p, modes=p.modes._replace(omega=omega, ratios=ratios), laws=tuple(laws))
 
 
 def _shared(fit: RecordFit) -> float:

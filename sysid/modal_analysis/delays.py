@@ -22,7 +22,14 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import factors_of_runs
-from sysid.modal_analysis.direct_terms import MOST_DAMPED, BesidePoles, beside_poles, beside_poles_at, telling_lines
+from sysid.modal_analysis.direct_terms import (
+    MOST_DAMPED,
+    BesidePoles,
+    beside_poles,
+    beside_poles_at,
+    telling_lines,
+    without_window,
+)
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.residues import Records
@@ -106,7 +113,8 @@ class Clock:
 
     @classmethod
     def of(cls, given: Measurement) -> Clock:
-        """Take off the delays that a test shows."""
+        """Take off the delays that a test shows, and what a known window makes of its poles."""
+        given = without_window(given)
         try:
             beside = beside_poles(given)
             delays = find_delays(given, beside)
@@ -279,9 +287,13 @@ class _Late:
         return gained > more * np.log(numbers) / 2
 
     def shows_beyond(self, other: _Late) -> bool:
-        """True where it has more unknowns and the likelihood is larger beyond what chance makes of these."""
+        """True where it has more unknowns and the likelihood is larger beyond what chance makes of these.
+
+        Of averages, whose base has noise at the peaks, and what their window blurs, the channels share their errors.
+        """
         gained, more, _ = self._gained_over(other)
-        return more > 0 and 2 * gained > beyond_chance(more, self.delays.size)
+        shared = self.level.size if self.still.averaged else 1
+        return more > 0 and 2 * gained > shared * beyond_chance(more, self.delays.size)
 
     def _gained_over(self, other: _Late) -> tuple[float, int, float]:
         """Likelihood over another's, its logarithm, unknowns more than it has, and independent numbers of both."""
@@ -378,11 +390,11 @@ def _settled(best: _Late, steps: int = 15, near: float = 0.05, *, held: bool = F
 def _found(end: _Late, test: Measurement) -> Delays | None:
     """Delays beyond chance at the end of a fit, of the channels that tell them and that it explains.
 
-    Of whole records, whose base has noise that all channels share, those far beyond it.
+    Of whole records and averages, whose base has noise that all channels share, those far beyond it.
     """
     shown = np.diag(end.equations[0])[end.poles.size :] > 0
     told = np.flatnonzero(shown & (end.misfits < UNEXPLAINED))
-    covariance = end.step()[2][np.ix_(told, told)] * (_FAR**2 if test.is_whole else 1.0)
+    covariance = end.step()[2][np.ix_(told, told)] * (_FAR**2 if test.is_whole or test.averaged else 1.0)
     found = delays_beyond_chance(end.delays[told], covariance, least_delay(test))
     if found is None:
         return None

@@ -15,7 +15,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.spectra import blurred
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
@@ -108,6 +110,83 @@ def beside_poles_at(test: Measurement) -> BesidePoles | None:
         test = test.at(~at.spikes)
         at = _relocated(test)
     return None if every is None or at is None else BesidePoles(test, every, at)
+
+
+def under_hann(freq: Array, pole: ComplexArray, seconds: float) -> ComplexArray:
+    r"""What blocks of so many seconds make of ``1 / (i w - pole)`` at lines in Hz, (k, n_freq) of poles (k,), rad/s.
+
+    Of functions H1 under Hann's window, with an input of all frequencies: the transform of the impulse response times
+    the window's autocorrelation r,
+
+    .. math:: \int_0^T r(t) e^{(\lambda - i w) t} dt = T \left[\frac23 E_1(p) + \frac{E_1(p - q) + E_1(p + q)}{6}
+              + \frac{E_0(p - q) - E_0(p + q)}{4 \pi i}\right], \quad p = (i w - \lambda) T, \quad q = 2 \pi i,
+
+    with :math:`E_0 = (1 - e^{-p}) / p` and :math:`E_1 = (p - 1 + e^{-p}) / p^2`.
+    """
+    p, q = (2j * np.pi * freq - pole[:, None]) * seconds, 2j * np.pi
+    first = lambda p: (1 - np.exp(-p)) / p  # noqa: E731
+    second = lambda p: (p - 1 + np.exp(-p)) / p**2  # noqa: E731
+    sides = (second(p - q) + second(p + q)) / 6 + (first(p - q) - first(p + q)) / (4j * np.pi)
+    return np.asarray(seconds * (2 / 3 * second(p) + sides))
+
+
+@one_thread()
+def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Measurement:
+    """The test without what Hann's window makes of its poles; as it is where none was stated.
+
+    Until that moves no line by more than `near` of its deviation. Poles whose half-power width is less than the
+    distance of lines are noise at some line, which a narrow peak would be made of. Where its lines are no even ones, it
+    is no test of functions or shows no poles, the window counts among its errors.
+    """
+    if test.window != "hann":
+        return test
+    spacing = float(np.diff(test.freq).min()) if test.freq.size > 1 else np.inf
+    even = np.allclose(test.freq / spacing, np.round(test.freq / spacing), atol=0.01)
+    turned = test = replace(test, window="taken off")
+    try:
+        for _ in range(rounds if even and test.has_unit_runs else 0):
+            beside = beside_poles(turned)
+            if beside is None:
+                break
+            wide = beside.at.ratios * beside.at.omega > np.pi * spacing
+            off = _by_window(turned, beside.at.omega, beside.at.ratios, wide, spacing)
+            force = None if test.force is None else test.force - off[:, test.n_sensors :]
+            before, turned = turned, replace(test, response=test.response - off[:, : test.n_sensors], force=force)
+            size = 1e-3 * np.abs(test.response) if test.response_std is None else test.response_std
+            if np.all(np.abs(turned.response - before.response) < near * size):
+                break
+    except (InputError, np.linalg.LinAlgError):
+        turned = test
+    if turned is not test:
+        return turned
+    pairs = (test.response_std, test.response), (test.force_std, test.force)
+    of_window = [None if std is None or H is None else np.hypot(std, blurred(H)) for std, H in pairs]
+    return replace(test, window="", response_std=of_window[0], force_std=of_window[1])
+
+
+def _by_window(test: Measurement, omega: Array, ratios: Array, some: NDArray[np.bool_], spacing: float) -> ComplexArray:
+    """What the window adds to `some` poles in responses and force, (runs, channels, n_freq), by residues at all."""
+    every = np.concatenate([test.response] + ([] if test.force is None else [test.force]), axis=1)
+    deviations = (test.response_std, test.response), (test.force_std, test.force)
+    stds = [np.ones(H.shape) if std is None else std for std, H in deviations if H is not None]
+    pole = omega * (-ratios + 1j * np.sqrt(1 - ratios**2))
+    plain, hann = (
+        np.concatenate([one + other, 1j * (one - other)])
+        for one, other in (
+            [1 / (2j * np.pi * test.freq - at[:, None]) for at in (pole, pole.conj())],
+            [under_hann(test.freq, at, 1 / spacing) for at in (pole, pole.conj())],
+        )
+    )
+    x = test.freq / test.freq[-1]
+    columns = np.concatenate([plain, np.stack([x**0 + 0j, 1j * x, x**2 + 0j])])
+    size = np.sqrt(np.mean(np.abs(columns) ** 2, axis=1))
+    off, weights = np.zeros(every.shape, complex), 1 / np.concatenate(stds, axis=1)
+    for at in np.ndindex(every.shape[:2]):
+        weight = weights[at]
+        rows, data = weight * columns / size[:, None], weight * every[at]
+        found = np.linalg.lstsq(np.hstack([rows.real, rows.imag]).T, np.hstack([data.real, data.imag]), rcond=None)[0]
+        off[at] = np.where(np.tile(some, 2), (found / size)[: len(plain)], 0.0) @ (hann - plain)
+    return off
 
 
 @one_thread()

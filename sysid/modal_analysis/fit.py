@@ -18,8 +18,9 @@ from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
 from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
+from sysid.modal_analysis.direct_terms import without_window
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.growing_errors import errors_grow, may_grow
+from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import (
@@ -27,6 +28,7 @@ from sysid.modal_analysis.model_order import (
     no_modes,
     peaks_of,
     with_further_modes,
+    with_static_modes,
     without_spurious_modes,
 )
 from sysid.modal_analysis.record_fit import (
@@ -164,19 +166,21 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     fit = _whole_fit(without_delays(test, delays), monitor)
     try:
         for _ in range(rounds):
-            left = delays_left(fit)
-            if left is None:
-                break
-            monitor.doing, total = "delays", delays + left
-            turned = without_delays(test, total)
-            if np.any((total != 0) & (delays == 0)):
-                trial = _whole_fit(turned, monitor)
+            # What shares of the signal hold of a delay hides it: then it shows by what the fit gains without it.
+            hidden = delays_left(fit, missed=1.0) if fit.model.whole.grows else None
+            for left, times in ((hidden, 25.0), (delays_left(fit), 1.0)):
+                total = delays if left is None else delays + left
+                new = (total != 0) & (delays == 0)
+                if left is None or (times > 1 and not np.any(new)):
+                    continue
+                monitor.doing, turned = "delays", without_delays(test, total)
+                trial = _whole_fit(turned, monitor) if np.any(new) else on_turned(fit, turned, monitor=monitor)
+                price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
+                if trial.schwarz - fit.schwarz >= times * price * np.log(fit.model.numbers) / 2:
+                    fit, delays = trial, total
+                    break
             else:
-                trial = on_turned(fit, turned, monitor=monitor)
-            price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
-            if trial.schwarz - fit.schwarz < price * np.log(fit.model.numbers) / 2:
                 break
-            fit, delays = trial, total
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
             fit = on_turned(fit, without_delays(test, np.where(certain, delays, 0.0)), monitor=monitor)
@@ -331,11 +335,9 @@ def fit_modes(
         As `whole_fit` does.
     """
     values, calibration = None if delays is None else delays.values, calibration or Calibration.stated(test)
-    test = calibrated(test, calibration)
+    test = calibrated(without_window(test), calibration)
     if test.whole is None:
-        turned = test if values is None else without_delays(test, values)
-        found = _of_lines(turned, calibration, monitor or FitMonitor())
-        return replace(found, delays=delays)
+        return _of_lines(test, delays, calibration, monitor)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
         fit = whole_fit(test, values, monitor=monitor)
         if calibration is not None and not (fit.stopped or np.any(calibration.values)):
@@ -343,12 +345,16 @@ def fit_modes(
         return estimate(fit, calibration)
 
 
-def _of_lines(test: Measurement, calibration: Calibration | None, monitor: FitMonitor) -> ModalEstimate:
+def _of_lines(
+    test: Measurement, delays: Delays | None, calibration: Calibration | None, asked: FitMonitor | None
+) -> ModalEstimate:
     """The estimate of lines that stand for themselves; with modes where their errors grow with the signal.
 
     Where shares of the signal do not explain what is left, a model misses something: then the lines stand as given.
     """
-    plain = replace(ModalEstimate.of_lines(test), calibration=calibration)
+    given, monitor = test, asked or FitMonitor()
+    test = test if delays is None else without_delays(test, delays.values)
+    plain = replace(ModalEstimate.of_lines(test), delays=delays, calibration=calibration)
     if test.sample_rate is not None or not may_grow(test):  # records in time have noise of a level
         return plain
     try:
@@ -357,13 +363,22 @@ def _of_lines(test: Measurement, calibration: Calibration | None, monitor: FitMo
             plain = replace(plain, poles=poles)
             if not errors_grow(test, poles):
                 return plain
-            fit = _whole_fit(replace(test, whole=SteadyLines.of(test.n_runs, test.freq)), monitor)
-            if uneven(fit, but=0.03):  # as where squares take the place of noise
+            given = replace(given, whole=SteadyLines.of(test.n_runs, test.freq))
+            late = np.zeros(0) if delays is None else delays.values
+            fit = _on_one_clock(given, delays=late, monitor=monitor) if late.size else _whole_fit(given, monitor)
+            above = with_static_modes(fit, monitor=monitor)  # what these leave is no noise
+            found = with_profile(above, monitor)
+            if uneven(found, but=0.03):  # as where squares take the place of noise
                 return plain
+            fit = found if above is fit else on_turned(fit, found.test, monitor=monitor)
             if calibration is not None and not np.any(calibration.values):
                 fit, calibration = _calibrated(fit, calibration, monitor)
             return estimate(fit, calibration)
-    except (InputError, np.linalg.LinAlgError, Stop, KeyboardInterrupt):  # what is over ends the search that follows
+    except (InputError, np.linalg.LinAlgError):
+        return plain
+    except (Stop, KeyboardInterrupt):  # what is over ends the search that follows
+        if asked is None:
+            raise
         return plain
 
 

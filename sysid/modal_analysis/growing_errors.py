@@ -8,16 +8,18 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import SteadyLines
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
-from sysid.modal_analysis.noise_levels import plain_levels
-from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.noise_levels import interpolation_matrix, likeliest_levels, likeliest_profile, plain_levels
+from sysid.modal_analysis.record_fit import RecordFit, refitted
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter
 from sysid.modal_analysis.residues import linear_residues
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import beyond_chance
 
 
 def may_grow(test: Measurement, least: int = 32) -> bool:
@@ -41,6 +43,36 @@ def errors_grow(test: Measurement, poles: Poles, much: float = 5.0, least: float
     ranks = [_ranks(one) for one in (errors, test.response - errors)]
     along = np.mean(ranks[0] * ranks[1], axis=-1) * np.sqrt(test.freq.size - 1)
     return bool(np.sum(along) > much * np.sqrt(along.size))
+
+
+def with_profile(fit: RecordFit, monitor: FitMonitor, rounds: int = 4, most: float = 0.03) -> RecordFit:
+    """The fit with noise that varies over the lines, alike in all channels; as it is where that is no likelier.
+
+    It is smooth in the root of frequency, but for a share of the lines, `most` at most, that stand out beyond chance in
+    all runs together, as about the frequency of the mains.
+    """
+    ends, lines, p = np.sqrt(fit.test.freq[[0, -1]]), fit.test.freq.size, fit.parameters
+    shape, numbers = interpolation_matrix(np.sqrt(fit.test.freq), *ends), 2 * fit.model.channels * fit.test.n_runs
+    trial, beside = fit, np.zeros(lines)
+    for _ in range(rounds):
+        trial = _at_profile(trial, likeliest_profile(trial.model, p, trial.levels, shape, beside))
+        power = np.zeros(lines)
+        for chunk in trial.model.chunks(p):
+            power[chunk.run.among(fit.test.freq)] += 2 * chunk.weighed(trial.levels).power
+        size = np.log(np.maximum(power, 1.0) / numbers) + beside
+        out = (size >= np.sort(size)[-int(np.ceil(most * lines))]) & (power > beyond_chance(numbers, lines))
+        beside = np.where(out | (beside > 0), np.maximum(size, 0.0), 0.0)
+    monitor.doing = "noise that varies over the lines"
+    trial = refitted(trial, p, monitor=monitor)
+    price = (shape.shape[1] - 1 + np.count_nonzero(beside)) * np.log(fit.model.numbers) / 2
+    return trial if trial.settled and trial.schwarz - fit.schwarz > price else fit
+
+
+def _at_profile(fit: RecordFit, logarithm: Array) -> RecordFit:
+    """The fit with this profile of the noise, and the levels that are likeliest beside it, the modes as they are."""
+    assert isinstance(fit.test.whole, SteadyLines)
+    fit = replace(fit, test=replace(fit.test, whole=replace(fit.test.whole, profile=np.exp(logarithm))))
+    return replace(fit, levels=likeliest_levels(fit.model, fit.parameters, fit.levels))
 
 
 def scatter_of_lines(test: Measurement, modes: Modes, rigid: Array, most: int = 1000) -> tuple[Array, Array] | None:

@@ -62,7 +62,7 @@ class LawMotions:
         self.lines = [test.freq[lines] for lines in test.own_lines]
         self.base = [base[:, lines] for base, lines in zip(test.base, test.own_lines, strict=True)]
         self._series: dict[tuple[int, int], tuple[int, Array]] = {}
-        self._last: tuple[Parameters | None, dict[tuple[int, int], Addition]] = (None, {})
+        self._last: dict[tuple[int, int], tuple[Array, Addition]] = {}
 
     def places(self, run: int) -> NDArray[np.intp]:
         """Numbers of the lines of a run among all of its Fourier transform."""
@@ -85,13 +85,14 @@ class LawMotions:
         return self.of_run(p, run.number, law).at(part)
 
     def of_run(self, p: Parameters, run: int, law: int) -> Addition:
-        """What a law adds at all lines of a run; that of the last parameters is kept."""
-        if self._last[0] is not p:
-            self._last = (p, {})
-        found = self._last[1]
-        if (run, law) not in found:
-            found[run, law] = self._added(p, run, p.laws[law])
-        return found[run, law]
+        """What a law adds at all lines of a run; that of the last numbers of it is kept."""
+        one, modes = p.laws[law], p.modes
+        k, size = one.mode, modes.phi[one.sensor, one.mode]
+        beside = [k, *one.form, modes.omega[k], modes.ratios[k], size]
+        numbers = np.concatenate([modes.gamma[k], p.ends[k], one.values, one.equivalent[run], beside])
+        if (run, law) not in self._last or not np.array_equal(self._last[run, law][0], numbers):
+            self._last[run, law] = numbers, self._added(p, run, one)
+        return self._last[run, law][1]
 
     def _added(self, p: Parameters, run: int, law: ModeLaw) -> Addition:
         modes, k = p.modes, law.mode

@@ -137,17 +137,17 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     transients = np.moveaxis(transients, 0, -1)  # (c, 2 n, L)
     for run, (lines, rest) in enumerate(zip(test.own_lines, test.whole.at_rest, strict=True)):
         of_ends = transients[:, :0] if rest else transients
-        taken[run][:, lines] = _fitted(left[run][:, lines], of_ends[..., lines], w[lines] / w[-1])
+        traces = test.whole.traces(test.freq[lines], test.freq[-1])[: test.whole.of_sampling]
+        taken[run][:, lines] = _fitted(left[run][:, lines], of_ends[..., lines], traces)
     s = test.n_sensors
     force = None if test.force is None else test.force - taken[:, s:]
     return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
 
 
-def _fitted(left: ComplexArray, transients: ComplexArray, unit: Array) -> ComplexArray:
+def _fitted(left: ComplexArray, transients: ComplexArray, traces: ComplexArray) -> ComplexArray:
     """The part of what is left (c, L) that transients (c, p, L) and traces of each channel explain."""
     _, p, lines = transients.shape
-    traces = stacked(np.stack([np.ones(lines) + 0j, 1j * unit, -1j / unit]))  # (2 L, 3)
-    Q = np.linalg.qr(traces)[0]
+    Q = np.linalg.qr(stacked(traces))[0]
     size = np.linalg.norm(left, axis=1)
     size[size == 0] = 1.0
     rows = np.array([stacked(part) for part in transients]) / size[:, None, None]  # (c, 2 L, p)

@@ -25,6 +25,7 @@ from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import coupled_flexibility, gains, modes_above, motion_and_slopes, real_times
 from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import EPSILON
 
 FAR = 30.0  # logarithms of frequencies and damping ratios: no step of use leads beyond
 
@@ -43,13 +44,20 @@ class Run(NamedTuple):
     """Row of the levels of noise: runs are cut where levels vary over the lines."""
     signal: Array | None = None
     """(c + d, L): squares of what outputs and base hold at each line, where noise is a share of it; held in a fit."""
+    profile: Array | float = 1.0
+    """(L,): what is no share of it, over its level: see `SteadyLines`."""
 
     def at(self, lines: Any) -> Run:
         """Some of its lines."""
         return self._replace(
             w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines],
             signal=None if self.signal is None else self.signal[:, lines],
+            profile=self.profile if isinstance(self.profile, float) else self.profile[lines],
         )  # fmt: skip
+
+    def among(self, freq: Array) -> NDArray[np.intp]:
+        """Which of all lines of a test, Hz, its own are, (L,)."""
+        return np.searchsorted(freq, self.w / (2 * np.pi) * (1 - EPSILON))
 
     def variances(self, levels: Array) -> Array:
         """Variances of the noise of outputs and base at its lines, (c + d, L), or (c + d, 1) where all are alike.
@@ -61,7 +69,7 @@ class Run(NamedTuple):
         if self.signal is None:
             return np.asarray(of_piece * self.density)
         plain, shares = np.split(of_piece, 2)
-        return np.asarray(plain * self.density + shares * self.signal)
+        return np.asarray(plain * self.density * self.profile + shares * self.signal)
 
 
 class Weighed(NamedTuple):
@@ -444,3 +452,14 @@ def pairs_of(m: int, *, both: bool) -> NDArray[np.intp]:
     """Pairs of different modes, (k, 2), each once or, with `both`, in both orders."""
     apart = np.argwhere(~np.eye(m, dtype=bool))
     return apart if both else apart[apart[:, 0] < apart[:, 1]]
+
+
+def segments(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
+    """Stretches of the lines of a run, (L,), rad/s, `most` at most and of so many lines at least: of one level each."""
+    root = np.sqrt(w)
+    bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], most + 1)[1:-1]))
+    cuts = [0]
+    for bound in bounds:
+        if bound - cuts[-1] >= lines and w.size - bound >= lines:
+            cuts.append(int(bound))
+    return [slice(a, b) for a, b in zip(cuts, [*cuts[1:], w.size], strict=True)]

@@ -204,10 +204,14 @@ def _in_gauge(fit: RecordFit) -> RecordFit:
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
-    """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line."""
-    modes = fit.parameters.modes
-    narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
-    return np.asarray((modes.ratios >= DAMPED) | narrow)
+    """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line.
+
+    And for those that drift makes: of less than two periods a record, or of four below the lines.
+    """
+    modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
+    below = modes.omega < 2 * np.pi * fit.test.freq[0]
+    slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
+    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
 
 
 def least_worth(model: RecordModel) -> float:

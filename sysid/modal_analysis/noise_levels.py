@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from sysid.modal_analysis.modal_model import Run, base_noise, dots
 from sysid.modal_analysis.record_model import Parameters, RecordModel
-from sysid.modal_analysis.varying_levels import designs
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE
 
+KNOTS = 5  # frequencies at which a level that varies is a number of its own, evenly in the root of frequency
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
 NO_NOISE = 2 * VANISHING  # levels at the least, which the fit's own numbers raise a little, are no noise
@@ -73,6 +74,32 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array) -> Array:
         bounds = least[rows], most[rows] / _of_noise(model)
         found[rows] = _of_run([part for part in parts if part.run.piece in D], D, levels[rows], bounds)
     return found * _of_noise(model)
+
+
+def likeliest_profile(model: RecordModel, p: Parameters, levels: Array, shape: Array, beside: Array) -> Array:
+    """Profile of `SteadyLines`, its logarithm (n_freq,) smooth, of the columns of `shape`, and `beside` that.
+
+    The levels are what they are.
+    """
+    each: Array = np.eye(levels.shape[1])
+    every, parts = {0: each}, _parts(model, p)
+    at = [part.run.among(model.test.freq) for part in parts]
+
+    def unlikely(y: Array) -> float:
+        profile = np.exp(shape @ y + beside)
+        turned = [
+            part._replace(run=part.run._replace(piece=0, profile=profile[i])) for part, i in zip(parts, at, strict=True)
+        ]
+        values = [
+            _likelihood([one], every, np.log(levels[part.run.piece]))[0]
+            for one, part in zip(turned, parts, strict=True)
+        ]
+        return -float(np.sum(values))
+
+    first = np.zeros(shape.shape[1])
+    return np.asarray(
+        shape @ scipy.optimize.minimize(unlikely, first, method="BFGS", options={"maxiter": 20}).x + beside
+    )
 
 
 def _of_noise(model: RecordModel) -> float:
@@ -216,7 +243,11 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
         excess = np.vstack([_squares(Ge) - 1 + hidden, _squares(TGe) - np.diagonal(TGT).T.real])
         if run.signal is not None:
             # What each level makes of the variance at each line, by its logarithm, over that variance.
-            by = levels[:, None] * np.vstack([np.full_like(v, run.density), run.signal]) / np.tile(v, (2, 1))
+            by = (
+                levels[:, None]
+                * np.vstack([np.full_like(v, run.density) * run.profile, run.signal])
+                / np.tile(v, (2, 1))
+            )
             inverse = np.einsum("jcl,jel->cel", V, V.conj())
             inverse[np.arange(c), np.arange(c)] -= 1
             G = np.concatenate([np.concatenate([inverse, GT.swapaxes(0, 1)], axis=1),
@@ -245,3 +276,39 @@ def _outer_squares(V: ComplexArray) -> Array:
             product = one * V[j].conj()
             out += (2 - (i == j)) * dots(product, product)
     return out
+
+
+def interpolation_matrix(middles: Array, first: float, last: float) -> Array:
+    """Linear interpolation from the values at the `KNOTS` to the middles of segments, (segments, knots)."""
+    at = np.linspace(np.sqrt(first), np.sqrt(last), KNOTS)
+    return np.array([np.interp(np.sqrt(middles), at, one) for one in np.eye(KNOTS)]).T
+
+
+def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]) -> list[Array]:
+    """Matrices from the numbers of a run to the logarithms of all levels, (channels, numbers) a stretch.
+
+    Parameters
+    ----------
+    middles : (segments,)
+        Middles of stretches, rad/s.
+    ends : (first, last)
+        Lines of the run, rad/s.
+    varies : (channels,) of bool
+        Channels whose levels vary; others have one number.
+    """
+    if not np.any(varies):
+        return [np.eye(varies.size)] * middles.size
+    shape = interpolation_matrix(middles, *ends)
+    first = np.concatenate([[0], np.cumsum(np.where(varies, KNOTS, 1))])
+    matrices = []
+    for row in shape:
+        D = np.zeros((varies.size, first[-1]))
+        for channel, varying in enumerate(varies):
+            D[channel, first[channel] : first[channel + 1]] = row if varying else 1.0
+        matrices.append(D)
+    return matrices
+
+
+def extra_numbers(varying: NDArray[np.bool_] | None) -> int:
+    """Numbers that varying levels take more than constant ones."""
+    return 0 if varying is None else (KNOTS - 1) * int(np.count_nonzero(varying))

@@ -24,6 +24,7 @@ from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.modal_model import ModeLaw, trace_count
 from sysid.modal_analysis.noise_levels import (
     bounded_by_lines,
+    extra_numbers,
     floors,
     likeliest_levels,
     plain_levels,
@@ -35,7 +36,6 @@ from sysid.modal_analysis.record_model import (
     RecordModel,
 )
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.varying_levels import extra_numbers
 from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
@@ -183,12 +183,13 @@ class RecordFit:
 
     def to_tree(self) -> dict[str, Any]:
         """Give what was found, without the records, as dictionaries, arrays and numbers; `from_tree` takes it back."""
-        p = self.parameters
+        p, whole = self.parameters, self.model.whole
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": self.model.whole.plain, "grows": self.model.whole.grows,
+            "gains": p.gains, "plain": self.model.whole.plain, "grows": whole.grows,
+            "profile": getattr(whole, "profile", None), "taken": whole.taken if whole.grows else None,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
 
@@ -202,7 +203,11 @@ class RecordFit:
             Where it is of another test.
         """
         if tree.get("grows", False) and test.whole is None:
-            test = replace(test, whole=SteadyLines.of(test.n_runs, test.freq))
+            profile, taken, of_lines = tree.get("profile"), tree.get("taken"), SteadyLines.of(test.n_runs, test.freq)
+            for one, size in ((profile, test.freq.size), (taken, test.n_sensors + (test.force is not None))):
+                wrong = one is not None and (one.shape != (size,) or not np.all(np.isfinite(one)))
+                refuse((wrong, "the stored fit of lines is of another test, or holds what is no number"))
+            test = replace(test, whole=replace(of_lines, profile=profile, taken=taken))
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]

@@ -32,10 +32,10 @@ from sysid.modal_analysis.modal_model import (
     Sums,
     dots,
     pairs_of,
+    segments,
     trace_count,
 )
 from sysid.modal_analysis.response import real_times
-from sysid.modal_analysis.varying_levels import segments
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -72,7 +72,7 @@ class RecordModel(SpectralModel):
         runs = [
             Run(
                 2 * np.pi * test.freq[mask], test.base[r][:, mask], outputs[r][:, mask], float(self.whole.density[r]),
-                r, np.ones(np.count_nonzero(mask)), r,
+                r, np.ones(np.count_nonzero(mask)), r, profile=self.whole.profile_at(mask),
             )
             for r, mask in enumerate(test.own_lines)
         ]  # fmt: skip

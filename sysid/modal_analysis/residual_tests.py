@@ -420,18 +420,19 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     return step / size[asked].reshape(n, d), chi2
 
 
-def delays_left(fit: RecordFit, near: float = 0.3) -> Array | None:
+def delays_left(fit: RecordFit, near: float = 0.3, *, missed: float = _MISSED) -> Array | None:
     """Delays of sensors and force that a step of all unknowns from the end of a fit finds beyond chance, s, or None.
 
-    Those that were taken off already move too, where they are off by more than `near` of their deviation.
+    Those that were taken off already move too, where they are off by more than `near` of their deviation. Deviations
+    are `missed` times as large where what is left is no white noise.
     """
-    step, covariance = _delays(fit, np.eye(fit.asked.size - fit.asked.delays))
+    step, covariance = _delays(fit, np.eye(fit.asked.size - fit.asked.delays), missed)
     told = np.flatnonzero(np.diag(covariance))
     found = delays_beyond_chance(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
     if found is not None:
         return found.at(told, step.size).values
     late, _ = _taken(fit)
-    more, covariance = _delays(fit, late)
+    more, covariance = _delays(fit, late, missed)
     return late @ more if np.any(np.abs(more) > near * np.sqrt(np.diag(covariance))) else None
 
 
@@ -453,7 +454,7 @@ def _taken(fit: RecordFit) -> tuple[Array, bool]:
     return np.ones((taken.size, 1)) if of_base else np.eye(taken.size)[:, taken != 0], of_base
 
 
-def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
+def _delays(fit: RecordFit, along: Array, missed: float = _MISSED) -> tuple[Array, Array]:
     """Step of delays along columns (k, q) of all of them, s, and its covariance; zero where nothing tells them.
 
     Where what is left is no white noise the model misses something, which delays make up for as far as they can.
@@ -464,5 +465,5 @@ def _delays(fit: RecordFit, along: Array) -> tuple[Array, Array]:
     normal, size = unit_diagonal(turn.T @ fit.equations.normal @ turn)
     half = half_inverse(normal, ROUND_OFF)
     step, rows = half @ (half.T @ (turn.T @ fit.equations.gradient / size)), half[at:] / size[at:, None]
-    missed = _MISSED**2 if _missed(fit) else 1.0
-    return step[at:] / size[at:], missed * max(fit.reduced, 1.0) / 2 * rows @ rows.T
+    beyond = missed**2 if _missed(fit) else 1.0
+    return step[at:] / size[at:], beyond * max(fit.reduced, 1.0) / 2 * rows @ rows.T

@@ -197,7 +197,8 @@ def _as_test(
     inside = (freq >= test.freq[0] + margin) & (freq <= test.freq[-1] - margin)
     if not np.any(inside):
         return None
-    whole = WholeRecords(samples, rate, (False,) * len(pieces), noise)
+    tones = () if test.whole is None else test.whole.tones
+    whole = WholeRecords(samples, rate, (False,) * len(pieces), noise, tones=tones)
     given = (freq[inside], base[..., inside], response[..., inside])
     return Measurement(
         *given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole,

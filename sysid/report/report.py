@@ -11,7 +11,6 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import default_style
-from sysid.report.channels import noise, sensors
 from sysid.report.curves import curves, mode_shape_view
 from sysid.report.html import (
     Cell,
@@ -35,8 +34,10 @@ from sysid.report.opening import (
     half_widths,
     matrix_tables,
     noise_of_test,
+    noise_table,
     opening,
     rounded,
+    sensor_table,
     share_of_noise,
     trust,
     width_text,
@@ -139,8 +140,8 @@ def render(identification: Identification) -> str:
             ("Total mass", _rigid_body_mass(it)),
             ("Unknowns", _unknowns(it)),
             ("Matrices", matrix_tables(it)),
-            ("Noise", noise(it)),
-            ("Sensors", sensors(it)),
+            ("Noise", noise_table(it)),
+            ("Sensors", sensor_table(it)),
             ("Outliers", _outliers(it)),
             ("Poles in the data", _poles(it)),
             ("Modal assurance criterion", _mac(it)),

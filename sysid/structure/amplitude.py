@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse, whole_number
+from sysid.structure.simulation import spline_of
 from sysid.structure.thresholds import beyond_chance
 
 Array = NDArray[np.floating[Any]]
@@ -288,15 +289,13 @@ def modal_acceleration(
 ) -> Array:  # fmt: skip
     """Acceleration of a mode that follows a law, at the samples of its load, (n,).
 
-    The load, m/s², is the natural spline through its samples, straight over steps of `per_period` in a period.
+    The load, m/s², is the spline through its samples by which linear modes move, straight over steps of `per_period`
+    in a period.
     `mode` is of circular frequency, rad/s, damping ratio and shape at the law's sensor; `initial` as in `motion`.
     """
-    from scipy.interpolate import make_interp_spline
-
     numbers = np.concatenate([np.log(np.abs(mode)), law.values])
     times = max(int(np.ceil(per_period * mode[0] / (2 * np.pi) / rate)), 1)
-    samples = np.arange(load.size)
-    fine = make_interp_spline(samples, load, k=3, bc_type="natural")(np.arange((load.size - 1) * times + 1) / times)
+    fine = spline_of(load[None])(np.arange((load.size - 1) * times + 1) / times)[:, 0]
     return motion(law.form, fine, 1 / (rate * times), numbers, initial)[::times] - load
 
 

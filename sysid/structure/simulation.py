@@ -8,13 +8,16 @@ transition and the integrals of all powers of time (C. F. Van Loan, IEEE Trans. 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from sysid.structure.thresholds import ROUND_OFF
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -97,12 +100,16 @@ def _step(modes: ModalModel, step: float, degree: int) -> tuple[Array, Array]:
     return exponential[:size, :size], np.moveaxis(exponential[:size, size:].reshape(size, -1, d), 1, 0)
 
 
-def _spline_derivatives(base: Array, degree: int = 11) -> Array:
-    """Natural spline at the beginning of each step, its derivatives by steps: (degree + 1, d, n_samples - 1)."""
+def _spline_derivatives(base: Array) -> Array:
+    """The spline at the beginning of each step, and its derivatives by steps: (degree + 1, d, n_samples - 1)."""
+    spline = spline_of(base)
+    return np.stack([spline(np.arange(base.shape[1] - 1), nu=order).T for order in range(spline.k + 1)])
+
+
+def spline_of(base: Array, degree: int = 11) -> BSpline:
+    """Natural spline through samples (d, n_samples), by their number, of a lower degree where they are few."""
     from scipy.interpolate import make_interp_spline
 
-    samples = base.shape[1]
-    m = min(degree // 2 + 1, samples)
+    m = min(degree // 2 + 1, base.shape[1])
     still = [(order, np.zeros(len(base))) for order in range(m, 2 * m - 1)]  # at both ends
-    spline = make_interp_spline(np.arange(samples), base.T, k=2 * m - 1, bc_type=(still, still))
-    return np.stack([spline(np.arange(samples - 1), nu=order).T for order in range(2 * m)])
+    return make_interp_spline(np.arange(base.shape[1]), base.T, k=2 * m - 1, bc_type=(still, still))

@@ -176,6 +176,8 @@ class Structure:
         """The same structure with modes that follow their amplitude."""
         other = copy(self)
         other.laws = tuple(laws)
+        modes = [other.mode_of(law) for law in other.laws]
+        refuse((len(set(modes)) < len(modes), "laws: two of them are of one mode, the nearest in frequency: keep one"))
         return other
 
     def mode_of(self, law: FittedLaw) -> int:

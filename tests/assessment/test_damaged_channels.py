@@ -41,13 +41,15 @@ def test_a_gap_is_left_out_and_told_as_a_note():
     np.testing.assert_allclose(result.structure.mass, TRUTH.mass, atol=0.02 * 5)
 
 
-def test_hum_stays_in_the_records_and_is_a_caution():
+def test_hum_of_one_channel_is_fitted_and_told_as_a_note():
     every = records()
     every[1] += 0.2 * every[1].std() * np.sin(2 * np.pi * 6.3 * np.arange(N) / RATE)
     result, (found,) = identified(every)
-    assert (found.kind, found.severity, found.channel) == ("tone", Severity.CAUTION, "sensor 1")
-    assert found.numbers["value"] == pytest.approx(6.3, abs=0.1 * RATE / N)
-    assert result.judgement != "determined"
+    assert (found.kind, found.severity, found.channel) == ("tone", Severity.NOTE, "sensor 1")
+    assert found.numbers["value"] == pytest.approx(6.3, abs=0.02 * RATE / N)
+    assert (found.numbers["channels"], found.numbers["size"]) == (1, pytest.approx(0.2, abs=0.02))
+    assert result.judgement == "determined"
+    np.testing.assert_allclose(result.structure.mass, TRUTH.mass, atol=0.02 * 5)
 
 
 def test_equal_channels_are_a_caution():

@@ -123,3 +123,12 @@ def test_base_sensors_that_differ_are_told_beyond_their_tolerance(tolerance, tol
     notes = [one for one in result.findings if one.kind == "base sensors"]
     assert [one.severity for one in notes] == ["note"] * told
     assert [one.numbers["most"] for one in notes] == [pytest.approx(0.02)] * told
+
+
+@pytest.mark.parametrize(("slope", "severity"), [(0.0, "note"), (0.05, "contradicts")])
+def test_supports_that_move_apart_speak_against_a_misfit_alone(slope, severity):
+    read = (BaseSensor("west", 1.0, 0.06), BaseSensor("east", 1.01, 0.06))
+    test = dataclasses.replace(spectra(slope), base_sensors=read)
+    supports = [one for one in found(test) if one.kind in ("supports differ", "base sensors")]
+    assert [(one.kind, one.severity) for one in supports] == [("supports differ", severity)]
+    assert supports[0].numbers["most"] == pytest.approx(0.06)

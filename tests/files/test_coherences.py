@@ -7,7 +7,7 @@ from laboratory import FREQ, F, H, function, write_universal
 import sysid
 from sysid.errors import InputError
 from sysid.files import reading, recorded_test
-from sysid.measurement.spectra import std_of_functions
+from sysid.measurement.spectra import blurred, std_of_functions
 
 NAMES = ("h1", "h2", "h3", "F")
 AVERAGES = 40
@@ -45,10 +45,9 @@ def test_deviations_are_those_of_estimates():
     assert np.sqrt(np.mean(np.abs(estimate - 2) ** 2)) == pytest.approx(np.sqrt(np.mean(stated**2)), rel=0.06)
 
 
-def test_hanns_window_adds_what_it_blurs():
-    freq = np.linspace(-1, 1, 41)  # of a parabola, whose average over Hann's squared spectrum is off by h²/6 times 2
-    std = std_of_functions((freq**2).astype(complex), np.full(41, 1.0), AVERAGES, hann=True)
-    np.testing.assert_allclose(std[1:-1], np.hypot(0.05**2 / 3, freq[1:-1] ** 2 * 1e-3 / np.sqrt(AVERAGES)), rtol=1e-3)
+def test_hanns_window_blurs_a_parabola_by_a_third_of_the_squared_distance_of_lines():
+    freq = np.linspace(-1, 1, 41)  # its average over Hann's squared spectrum is off by h²/6 times 2
+    np.testing.assert_allclose(blurred((freq**2).astype(complex))[1:-1], 0.05**2 / 3, rtol=1e-6)
 
 
 @pytest.mark.parametrize("ending", ["csv", "unv"])

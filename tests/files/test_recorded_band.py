@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import sysid
 from sysid.cli import main as cli
 from sysid.files.recorded_test import RecordedTest
+from sysid.modal_analysis.fit import fit_modes
 
 RATE, N = 50.0, 6000
 TRUTH = sysid.Structure(
@@ -41,11 +43,11 @@ def test_the_default_lines_are_those_that_the_base_excites_and_a_stated_band_is_
     np.testing.assert_array_equal(test.measurement(estimator="h1").freq, plain.freq)
 
 
-def test_white_motion_is_fitted_in_all_the_lines_that_from_time_takes():
+def test_white_motion_is_fitted_in_all_the_lines_from_four_periods_a_record_on():
     test = recorded(0.0, RATE)
     plain = sysid.Measurement.from_time(test.runs, RATE, sensors=SENSORS, base_axes="x")
-    np.testing.assert_array_equal(test.measurement().freq, plain.freq)
-    np.testing.assert_array_equal(test.measurement().response, plain.response)
+    np.testing.assert_array_equal(test.measurement().freq, plain.freq[3:])  # those below hold drift
+    np.testing.assert_array_equal(test.measurement().response, plain.response[..., 3:])
 
 
 def test_drift_below_the_band_is_no_mode():
@@ -79,3 +81,16 @@ def test_read_and_run_tell_it_and_refuse_more_modes_than_stand_out_in_it(tmp_pat
     none = RecordedTest((run,), SENSORS, ("x",), (0.0, 0.0, 0.0), None, spectra.freq, ())
     (tmp_path / "spectra.h5").write_bytes(none.to_bytes())
     assert none.excited_band is None and "excited_band_hz" not in told("show", "spectra.h5")
+
+
+def test_drift_of_up_to_two_periods_a_record_makes_no_mode_and_no_line():
+    test = recorded(0.0, 20.0)
+    time, rng = np.arange(N) / N, np.random.default_rng(1)
+    drifted = [part + 0.02 * part.std() * np.sin(2 * np.pi * rng.uniform(0.5, 2) * time + rng.uniform(0, 6))
+               for part in test.runs[0]]  # fmt: skip
+    drifting = replace(test, runs=(tuple(drifted),))
+    assert drifting.measurement().freq[0] == pytest.approx(4 * RATE / N)
+    for one in (drifting.measurement(), drifting.measurement(band=(RATE / N, 20.0))):
+        found = np.sort(fit_modes(one).omega) / (2 * np.pi)
+        within = found[found < 20.0]
+        assert within == pytest.approx(TRUTH.natural_frequencies, rel=1e-3)

@@ -149,3 +149,13 @@ def test_the_band_ends_close_above_the_motion(high, seed):
     """A mode between the end of the motion and that of the band would hardly be shaken, and its mass be open."""
     found = band(random(between(1, high), seed) + noise(3e-3, seed + 20))
     assert high <= found[1] < 1.12 * high
+
+
+def test_hum_above_the_motion_is_no_motion_and_steps_of_a_sine_are():
+    motion, rng, t = random(between(2, 20)), np.random.default_rng(1), np.arange(N) / RATE
+    noise = 0.003 * rng.standard_normal((1, N))
+    hum = 0.003 * np.sin(2 * np.pi * 35.003 * t)
+    quiet, humming = (sysid.excited_band([(one, one, None)], RATE) for one in (motion + noise, motion + noise + hum))
+    assert humming == pytest.approx(quiet, abs=0.02)
+    louder = motion + noise + 20 * hum  # of which the base has six hundredths: it moves so
+    assert sysid.excited_band([(louder, louder, None)], RATE)[1] > 35

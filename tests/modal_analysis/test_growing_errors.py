@@ -11,13 +11,17 @@ from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.laboratory.stepped_tests import frame, spoiled
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.whole import SteadyLines
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.growing_errors import scatter_of_lines
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.noise_levels import _designs, _likelihood, _parts
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import RecordModel
+from sysid.modal_analysis.residual_tests import delays_of
 
 SHARES = 0.003, 0.01
 
@@ -144,6 +148,55 @@ def test_shares_are_told_and_stored_with_the_answer(tmp_path) -> None:
     np.testing.assert_array_equal(again.modal[0].shares, answer.modal[0].shares)
     assert again.summary() == answer.summary()
     np.testing.assert_array_equal(again.uncertainty.covariance, answer.uncertainty.covariance)
+
+
+def late_test(seed: int, late: float = 4e-4):
+    """A stepped sine of two levels, two sensors of which are late, with noise that rises with frequency, and hum."""
+    truth, test = spoiled("two levels", seed)
+    rng, f, delays = np.random.default_rng(seed), test.freq, np.zeros(test.n_sensors + 1)
+    delays[[0, 2]] = late
+    rms = np.sqrt(np.mean(np.abs(test.response) ** 2, axis=(0, 2)))[:, None]
+    mains = 1.3 * truth.poles[0][1]
+    size = 0.004 * f / f[-1] * (1 + 9 * (np.abs(f / mains - 1) < 0.015))
+    noise = rms * size * (rng.standard_normal((*test.response.shape, 2)) @ [1, 1j]) / np.sqrt(2)
+    return truth, without_delays(replace(test, response=test.response + noise), -delays), delays, mains
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_late_channels_noise_that_rises_and_hum_of_a_stepped_sine_are_found_beside_its_modes(seed: int) -> None:
+    truth, test, delays, mains = late_test(seed)
+    modal = fit_modes(test, Delays.none(test))
+    assert np.count_nonzero(modal.omega < 2 * np.pi * test.freq[-1]) == len(truth.mass)
+    np.testing.assert_array_equal(modal.delays.values != 0, delays != 0)
+    late = delays != 0
+    assert np.all(np.abs(modal.delays.values - delays)[late] < 4 * modal.delays.std[late])
+    assert np.all(modal.delays.std < 0.05 * delays.max())
+    profile = modal.record_fit.test.whole.profile
+    hum = np.abs(test.freq / mains - 1) < 0.015
+    assert np.all(profile[hum] > 10 * np.median(profile))
+    assert np.median(profile[~hum][-30:]) > 5 * np.median(profile[~hum][:30])
+
+
+def test_delays_and_the_profile_of_noise_are_stored_with_the_fit_and_refused_of_another_test() -> None:
+    _, test, *_ = late_test(0)
+    fit = fit_modes(test, Delays.none(test)).record_fit
+    tree, records = fit.to_tree(), replace(fit.test, whole=None)
+    again = RecordFit.from_tree(tree, records)
+    assert again.likelihood == fit.likelihood
+    np.testing.assert_array_equal(again.information(), fit.information())
+    np.testing.assert_array_equal(delays_of(again).std, delays_of(fit).std)
+    for name in ("profile", "taken"):
+        with pytest.raises(sysid.InputError, match="another test"):
+            RecordFit.from_tree({**tree, name: tree[name][1:]}, records)
+
+
+def test_ctrl_c_ends_a_fit_that_no_monitor_watches(monkeypatch) -> None:
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sysid.modal_analysis.fit.find_poles", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit_modes(spoiled("stepped", 0)[1])
 
 
 def test_noise_is_drawn_anew_with_the_shares_that_were_found() -> None:

@@ -4,9 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.signal
+from scipy.io import loadmat
 
 import sysid
+from sysid.cli.main import main
+from sysid.modal_analysis.amplitude_fit import _envelopes, _with_exponent
+from sysid.modal_analysis.fit import fit_modes, follow_amplitude
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import record_modes
 from sysid.structure.amplitude import LawForm
@@ -141,6 +147,71 @@ def test_a_stored_answer_keeps_its_law(answer, tmp_path):
     assert again.problem.amplitude == answer.problem.amplitude
     assert again.prepared.modal[0].omega == pytest.approx(answer.prepared.modal[0].omega, rel=1e-12)
     assert again.residual == pytest.approx(answer.residual, rel=1e-9)
+
+
+def test_an_export_at_a_level_holds_the_matrices_there_and_names_it(answer, tmp_path, capsys):
+    answer.save(tmp_path / "result.h5")
+
+    def exported(name, *options):
+        return main(["export", str(tmp_path / "result.h5"), str(tmp_path / name), *options])
+
+    assert exported("rest.mat") == exported("there.mat", "--level", "2.5") == 0
+    rest, there = (loadmat(tmp_path / name) for name in ("rest.mat", "there.mat"))
+    linear = answer.structure.at_level(2.5)
+    assert np.array_equal(rest["K"], answer.structure.stiffness)
+    assert np.array_equal(there["K"], linear.stiffness)
+    lam = scipy.linalg.eigh(there["K"][:2, :2], there["M"][:2, :2], eigvals_only=True)
+    assert np.sqrt(lam[0]) / (2 * np.pi) == pytest.approx(answer.structure.laws[0].at(2.5)[0], rel=1e-9)
+    about = [str(cell[0]) for cell in there["about"][:, 0]]
+    assert sum("mode 1" in line and "2.5 m/s2" in line for line in about) == 1
+    for wrong in ("-1", "nan", "high"):
+        assert exported("wrong.mat", "--level", wrong) == 2
+        assert len(capsys.readouterr().err.strip().splitlines()[-1]) > 0
+    assert not (tmp_path / "wrong.mat").exists()
+
+
+def test_a_level_of_a_structure_without_laws_is_refused(test, tmp_path):
+    plain = sysid.identify(sysid.Problem(test), rng=0)
+    with pytest.raises(sysid.InputError, match="--amplitude"):
+        sysid.export(plain, tmp_path / "there.csv", level=2.5)
+
+
+@pytest.mark.parametrize(("which", "exponent"), [("of_frequency", 2.0), ("of_damping", -1.0), ("of_damping", 2.0)])
+def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, which, exponent):
+    fit = record_modes(test, OMEGA, RATIOS)
+    law = ModeLaw(0, 1, LawForm(0.5, 0.5, 400.0), np.array([0.05, -0.004]), np.ones((2, 2)))
+    p = replace(fit.parameters, laws=(law,))
+    fit = replace(fit, parameters=p)
+    other = _with_exponent(fit, which, exponent)
+    levels = np.quantile(np.concatenate(_envelopes(fit, 0, 1)), (0.3, 0.95))
+
+    def at(p, level):
+        (one,), unit = p.laws, level / 400.0
+        a, b = one.values * unit ** np.array(one.form[:2])
+        return np.array([p.modes.omega[0] * (1 - a), p.modes.ratios[0] + b])
+
+    for level in levels:
+        assert np.allclose(at(p, level), at(other, level), rtol=1e-9)
+    assert getattr(other.laws[0].form, which) == exponent
+
+
+def test_a_fit_that_is_stopped_keeps_the_best_so_far(test):
+    fit = fit_modes(test)
+    most = []
+    for after in (0, 3, 9, 27):
+        calls = []
+
+        def stop(*_, calls=calls, after=after):
+            calls.append(1)
+            if len(calls) > after:
+                raise KeyboardInterrupt
+
+        monitor = FitMonitor(stop)
+        found = follow_amplitude(fit, sysid.AmplitudeLaw(exponents=(0.5, 1.0)), monitor)
+        assert found.record_fit.stopped
+        most.append(found.record_fit.likelihood)
+    assert most == sorted(most)
+    assert most[0] == pytest.approx(fit.record_fit.likelihood)
 
 
 def test_a_linear_structure_is_told_to_be_one():

@@ -8,9 +8,8 @@ from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.records.simulated import four_storeys
-from sysid.modal_analysis.modal_model import Run
-from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
-from sysid.modal_analysis.varying_levels import KNOTS, designs, segments
+from sysid.modal_analysis.modal_model import Run, segments
+from sysid.modal_analysis.noise_levels import KNOTS, ErrorSpectra, _likelihood, designs
 
 SETTING = four_storeys()
 RISE = 5.0

@@ -110,6 +110,37 @@ def test_at_a_level_the_mode_has_the_frequency_and_damping_of_the_law(linear):
     assert there.laws == ()
 
 
+def test_two_laws_of_one_mode_are_refused(linear):
+    with pytest.raises(sysid.InputError, match="one mode"):
+        linear.with_laws([law(), law(0.01)])
+
+
+@pytest.mark.parametrize(("per_period", "within"), [(4.0, 2e-3), (2.7, 8e-3)])
+def test_few_samples_a_period_are_enough_for_a_simulation(linear, per_period, within):
+    rate, followed = 4.0 * per_period, linear.with_laws([law()])
+    t = np.arange(round(12 * rate)) / rate
+
+    def base(t):
+        return 2.0 * np.sin(np.pi * t / 12) ** 2 * np.sin(2 * np.pi * 4.0 * t + 0.3)
+
+    phi, gamma, form = linear.mode_shapes, linear.participation[:, 0], law().form
+    omega, ratios = 2 * np.pi * linear.natural_frequencies, linear.damping_ratios
+    size = abs(phi[0, 0])
+
+    def slope(at, y):
+        (q, v), w, zeta = y.reshape(2, 2), omega.copy(), ratios.copy()
+        for _ in range(8):
+            level = size * w[0] * np.hypot(w[0] * q[0], v[0]) / form.level
+            w[0] = omega[0] * (1 - 0.03 * np.sqrt(level))
+        zeta[0] += 0.01 * level
+        return np.concatenate([v, -2 * zeta * w * v - w**2 * q - gamma * base(at)])
+
+    moved = solve_ivp(slope, (0, t[-1]), np.zeros(4), method="DOP853", t_eval=t, rtol=1e-9, atol=1e-12)
+    expected = np.array([phi @ slope(at, y)[2:] for at, y in zip(t, moved.y.T, strict=True)]).T
+    found = followed.simulate(base(t)[None], rate) - base(t)
+    assert np.linalg.norm(found - expected) < within * np.linalg.norm(expected)
+
+
 def test_a_stored_structure_keeps_its_laws(linear):
     again = sysid.Structure.from_tree(linear.with_laws([law()]).to_tree())
     (found,) = again.laws

@@ -23,6 +23,7 @@ CHECKS: tuple[Check, ...] = (
     mistakes.late_channels,
     mistakes.wrong_records,
     damaged_samples.damaged_channels,
+    gains.base_sensors,
     search_end.stopped,
     stated.keeping_bounds,
     model_error.changing_frequencies,
@@ -42,7 +43,6 @@ CHECKS: tuple[Check, ...] = (
     search_end.untried_modes,
     stated.on_a_bound,
     search_end.search_boxes,
-    gains.base_sensors,
     gains.modes_below,
     model_error.other_levels,
     search_end.lines_left_out,
@@ -56,4 +56,4 @@ OF_THE_END: tuple[Check, ...] = (
     model_error.beyond_noise,
     search_end.no_solution,
 )  # whether a search ended at a fit
-QUICK: tuple[Check, ...] = (*CHECKS[:3], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])
+QUICK: tuple[Check, ...] = (*CHECKS[:4], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])

@@ -295,7 +295,8 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
     if test.freq.size < 2 or not (test.averaged or test.has_unit_runs):
         return
     peaks = _peaks(test, structure)
-    coarse = peaks.spacing * _FEWEST > peaks.width
+    fewest = 1.5 if test.window == "taken off" else _FEWEST
+    coarse = peaks.spacing * fewest > peaks.width
     averaged = "" if test.averaged else "if these spectra are averages over segments, "
     groups = _found_twice(peaks, coarse, structure)
     if groups:

@@ -255,7 +255,7 @@ class Context:
 
         Beside one named before the search averages over segments are looked at all the same, for their leakage.
         """
-        if not self.is_judged or self.has("bounds", "table rocks", "soft bracket"):
+        if not self.is_judged or self.has("bounds", "supports differ", "table rocks", "soft bracket"):
             return True
         return bool(self.named) and not self.problem.screened.measurement.averaged
 

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.assessment.checks.context import Context, of_tests
+from sysid.assessment.checks.context import BEYOND, Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.gains import seen_at_sensors
 from sysid.measurement.measurement import Measurement
@@ -165,9 +165,27 @@ def below_lines(test: Measurement, structure: Structure) -> Array:
 
 
 def base_sensors(context: Context) -> Iterator[Finding]:
-    """Sensors of one motion of the base differ, by more than their tolerance."""
-    problem = context.problem
-    yield from of_tests([list(_differ(one)) for one in problem.modal[problem.first_test - 1 :]])
+    """Sensors of one motion of the base differ, by gains beyond their tolerance or as supports that move apart."""
+    problem, misses = context.problem, any(miss.times > BEYOND for miss in context.misses)
+    severity = context.weight if misses else Severity.NOTE
+    tests = problem.modal[problem.first_test - 1 :]
+    yield from of_tests([list(_unlike(one.given, severity)) or list(_differ(one)) for one in tests])
+
+
+def _unlike(test: Measurement, severity: Severity, most: float = 0.02) -> Iterator[Finding]:
+    """What no gain makes of one motion is more than `most` of what a sensor reads."""
+    read = test.base_sensors
+    each = [float(np.sqrt(max(one.off**2 - (one.gain - 1) ** 2, 0.0))) for one in read]
+    if max(each, default=0.0) > most:
+        shares = ", ".join(f"{one.name} by {100 * share:.2g} %" for one, share in zip(read, each, strict=True))
+        yield Finding(
+            "supports differ", severity,
+            f"{len(read)} base sensors differ from the motion that is taken for that of the base, not by gains alone "
+            f"({shares} of what they read): the base bends or turns, or its supports move apart",
+            "state how else the base moves where it turns (base_axes, such as \"x rz\"); supports that each move for "
+            "themselves move alike below some frequency: end the lines there (band)",
+            numbers={"sensors": float(len(read)), "most": max(each)},
+        )  # fmt: skip
 
 
 def _differ(modal: ModalEstimate) -> Iterator[Finding]:

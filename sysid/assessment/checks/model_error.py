@@ -56,7 +56,7 @@ def beyond_noise(context: Context) -> Iterator[Finding]:
 
 def least_squares(context: Context) -> Iterator[Finding]:
     """No modes with noise in all channels explain whole records, and squares of what is left were fitted instead."""
-    if context.named or not context.is_judged or context.has("table rocks"):
+    if context.named or not context.is_judged or context.has("supports differ", "table rocks"):
         return
     for i, modal, structure in context.fits:
         whole = modal.given.whole
