@@ -386,11 +386,9 @@ class Measurement:
                 std = spectra.std_of_functions(function, seen, count)
                 response_std, force_std = (std, force_std) if function is H else (response_std, std)
         given = (
-            H,
-            F,
-            checked_deviations("response_std", response_std, H, read),
+            H, F, checked_deviations("response_std", response_std, H, read),
             checked_deviations("force_std", force_std, F, read),
-        )
+        )  # fmt: skip
         # The base direction comes first: it becomes the run.
         by_run: Any = [None if record is None else np.moveaxis(record, 1, 0) for record in given]
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}

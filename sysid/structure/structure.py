@@ -372,11 +372,8 @@ class Structure:
         loss = scipy.linalg.block_diag(self.modal_damping_matrix, np.diag(2 * beyond.damping_ratios * beyond.omega))
         if beyond.coupling is not None:
             loss += self._across(self.normal_modes)
-        return ModalModel(
-            np.concatenate([self._omega, beyond.omega]),
-            loss,
-            np.vstack([self.participation, beyond.participation]),
-        )
+        omega = np.concatenate([self._omega, beyond.omega])
+        return ModalModel(omega, loss, np.vstack([self.participation, beyond.participation]))
 
     def _across(self, modes: Array) -> Array:
         """Damping between residual modes and motions `modes` (n, n) of the degrees of freedom, (n + r, n + r)."""
