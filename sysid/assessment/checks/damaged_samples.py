@@ -38,7 +38,7 @@ def _tones(modal: ModalEstimate, beyond: float = 6.0) -> Iterator[Finding]:
         if np.max(times) > beyond:
             run, channel = np.unravel_index(np.argmax(np.where(times > beyond, share, 0.0)), share.shape)
             count = int(np.count_nonzero(np.any(times > beyond, axis=0)))
-            others = f", and so do {count - 1} others" * (count > 1)
+            others = f", the largest of {count} channels" * (count > 1)
             yield Finding(
                 "tone", Severity.NOTE,
                 f"{names[channel]} hums at {tone:.5g} Hz all along, by {100 * share[run, channel]:.2g} % of its rms"
