@@ -690,8 +690,8 @@ DAMAGED = [
     ),
     (
         ("tone", 1, 6000, 50.0), False,
-        "sensor 2 hums at 50 Hz all along: a steady tone that no other channel has; it stays in the records: find its "
-        "source, such as the mains or a fan, or leave this channel out",
+        "sensor 2 hums at 50 Hz all along: a steady tone that no other channel has; it stays in these records: take "
+        "whole records, which fit it, or find its source, such as the mains",
     ),
     (
         ("equal channels", 1, 6000, 1.0), False,

@@ -396,7 +396,7 @@ def _add_export(command: Adder) -> None:
     _add_result(export)
     export.add_argument("file", metavar="FILE", help="the file to write")
     export.add_argument("--positive-axes", action="store_true", help="turn sensors along -x, -y, -z to +x, +y, +z")
-    export.add_argument("--level", type=float, metavar="A", help="m/s², of modes that follow their amplitude (at rest)")
+    export.add_argument("--level", type=float, metavar="A", help="m/s², of modes that follow their amplitude; else 0")
 
 
 def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) -> None:

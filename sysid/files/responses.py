@@ -122,6 +122,7 @@ def _deviations(
         if cells:
             force.append(np.sqrt(motions(cells, said, axes).T ** 2 @ np.array([values**2 for _, values in cells])))
     words = f"noise by the coherences of {said.averages} averages"
+    words += "; what Hann's window makes of peaks is taken off with the poles" * (said.window == "hann")
     return {"response_std": np.array(response), "force_std": np.array(force) if force else None}, [words]
 
 

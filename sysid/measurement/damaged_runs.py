@@ -22,7 +22,7 @@ _MADE_BY = {
     "spikes": "stand out of those around them, by up to {value:.4g}: spikes",
 }
 _REMEDIES = {
-    "tone": "it stays in the records: find its source, such as the mains or a fan, or leave this channel out",
+    "tone": "it stays in these records: take whole records, which fit it, or find its source, such as the mains",
     "equal channels": "it may be so by symmetry; else read the right one, or leave this channel out",
 }
 

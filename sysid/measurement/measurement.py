@@ -116,6 +116,7 @@ class Measurement:
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
         choice("missing", missing, ("refuse", "drop"))
+        choice("window", self.window, ("", "hann", "taken off"))
         put("freq", check_frequencies(self.freq))
         whole_number("dropped", self.dropped, at_least=0)
         lines: Array = self.freq
@@ -481,9 +482,8 @@ class Measurement:
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
         test = test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
-        parts = tuple(getattr(test, name) for name in _RECORDS[1:4] if getattr(test, name) is not None)
-        tones = test.whole and with_steady_tones(test.whole, test.freq, test.own_lines, *parts)
-        return replace(test, whole=tones)
+        parts = (test.base, test.response, *([] if test.force is None else [test.force]))
+        return replace(test, whole=test.whole and with_steady_tones(test.whole, test.freq, test.own_lines, *parts))
 
     noise_from_rest = staticmethod(levels_at_rest)
 

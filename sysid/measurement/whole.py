@@ -177,13 +177,8 @@ class WholeRecords:
         """
         unit = freq / last
         plain = np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])[: self.of_sampling]
-        return np.concatenate(
-            [
-                plain,
-                *map(self.of_tone, self.tones, [freq] * len(self.tones)),
-                np.exp(2j * np.pi * self.pulses(last)[0][:, None] * freq),
-            ]
-        )
+        of_tones = [self.of_tone(one, freq) for one in self.tones]
+        return np.concatenate([plain, *of_tones, np.exp(2j * np.pi * self.pulses(last)[0][:, None] * freq)])
 
     def of_tone(self, tone: float, freq: Array) -> ComplexArray:
         """Spectra at lines in Hz, (2, n), of whose real multiples that of any steady sine of `tone` Hz is made, and 1.

@@ -27,7 +27,7 @@ from sysid.modal_analysis.record_fit import (
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import EPSILON, ROUND_OFF, beyond_chance
+from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 
 def with_laws(
@@ -137,7 +137,7 @@ def _started(
     linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
     monitor: FitMonitor,
 ) -> RecordFit:  # fmt: skip
-    """Laws of these exponents, from the better of some falls of the frequency."""
+    """Laws of these exponents, from the first of some falls of the frequency that settles, else from the likeliest."""
     p = linear.parameters
     found = []
     for fall in tries:
@@ -204,7 +204,7 @@ def _white_errors(fit: RecordFit) -> ComplexArray:
     test, model = fit.test, fit.model
     left = np.zeros((model.channels, test.n_runs, test.freq.size), complex)
     for chunk in model.chunks(fit.parameters):
-        at = np.searchsorted(test.freq, chunk.run.w / (2 * np.pi) * (1 - EPSILON))
+        at = chunk.run.among(test.freq)
         left[:, chunk.run.number, at] = chunk.deviations(fit.levels)[0] * chunk.error
     return left
 

@@ -113,13 +113,12 @@ def _coupled(
     fit: RecordFit, p: Parameters, static: int, pruned: Callable[[RecordFit], RecordFit],
     some: Measurement | None, monitor: FitMonitor,
 ) -> RecordFit:  # fmt: skip
-    """The fit from parameters without couplings, with these, and without modes that stood for them."""
+    """The fit with couplings, from parameters without them; modes that stood for couplings are left out."""
     first = replace(p, coupling=np.zeros((p.modes.omega.size,) * 2))
     rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor, static=static))
     more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
     while more.model.m - static > 2:  # one may be worth much beside couplings, until the others have moved
-        value = worth(more)[: more.model.m - static]
-        poorest = np.arange(more.model.m) == np.argmin(value)
+        poorest = np.arange(more.model.m) == np.argmin(worth(more))
         fewer = refitted(more, without(more, poorest), some=some, limits=TRIAL, monitor=monitor)
         if not fewer.settled or more.likelihood - fewer.likelihood > least_worth(more.model):
             break

@@ -364,8 +364,8 @@ def _of_lines(
             if not errors_grow(test, poles):
                 return plain
             given = replace(given, whole=SteadyLines.of(test.n_runs, test.freq))
-            late = np.zeros(0) if delays is None else delays.values
-            fit = _on_one_clock(given, delays=late, monitor=monitor) if late.size else _whole_fit(given, monitor)
+            late = None if delays is None else delays.values
+            fit = _whole_fit(given, monitor) if late is None else _on_one_clock(given, delays=late, monitor=monitor)
             above = with_static_modes(fit, monitor=monitor)  # what these leave is no noise
             found = with_profile(above, monitor)
             if uneven(found, but=0.03):  # as where squares take the place of noise

@@ -51,9 +51,9 @@ def with_profile(fit: RecordFit, monitor: FitMonitor, rounds: int = 4, most: flo
     It is smooth in the root of frequency, but for a share of the lines, `most` at most, that stand out beyond chance in
     all runs together, as about the frequency of the mains.
     """
-    ends, lines, p = np.sqrt(fit.test.freq[[0, -1]]), fit.test.freq.size, fit.parameters
-    shape, numbers = interpolation_matrix(np.sqrt(fit.test.freq), *ends), 2 * fit.model.channels * fit.test.n_runs
-    trial, beside = fit, np.zeros(lines)
+    freq, p = fit.test.freq, fit.parameters
+    lines, shape = freq.size, interpolation_matrix(freq, *freq[[0, -1]])
+    numbers, trial, beside = 2 * fit.model.channels * fit.test.n_runs, fit, np.zeros(lines)
     for _ in range(rounds):
         trial = _at_profile(trial, likeliest_profile(trial.model, p, trial.levels, shape, beside))
         power = np.zeros(lines)

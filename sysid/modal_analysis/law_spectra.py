@@ -20,7 +20,6 @@ from sysid.modal_analysis.modal_model import ModeLaw, Parameters, Run
 from sysid.modal_analysis.response import gains_and_slopes
 from sysid.structure.amplitude import motion
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import EPSILON
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ class LawMotions:
 
     def added(self, p: Parameters, run: Run, law: int) -> Addition:
         """What a law adds at the lines of a part of a run."""
-        part = np.searchsorted(self.lines[run.number], run.w / (2 * np.pi) * (1 - EPSILON))
-        return self.of_run(p, run.number, law).at(part)
+        return self.of_run(p, run.number, law).at(run.among(self.lines[run.number]))
 
     def of_run(self, p: Parameters, run: int, law: int) -> Addition:
         """What a law adds at all lines of a run; that of the last numbers of it is kept."""

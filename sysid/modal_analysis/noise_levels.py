@@ -77,29 +77,20 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array) -> Array:
 
 
 def likeliest_profile(model: RecordModel, p: Parameters, levels: Array, shape: Array, beside: Array) -> Array:
-    """Profile of `SteadyLines`, its logarithm (n_freq,) smooth, of the columns of `shape`, and `beside` that.
+    """Likeliest profile of the noise (`SteadyLines`), its logarithm, (n_freq,), at these levels.
 
-    The levels are what they are.
+    It is `beside` plus a combination of the columns of `shape`.
     """
-    each: Array = np.eye(levels.shape[1])
-    every, parts = {0: each}, _parts(model, p)
-    at = [part.run.among(model.test.freq) for part in parts]
+    every: dict[int, Array] = dict(enumerate(np.split(np.eye(levels.size), len(levels))))
+    parts = [(part, part.run.among(model.test.freq)) for part in _parts(model, p)]
 
     def unlikely(y: Array) -> float:
         profile = np.exp(shape @ y + beside)
-        turned = [
-            part._replace(run=part.run._replace(piece=0, profile=profile[i])) for part, i in zip(parts, at, strict=True)
-        ]
-        values = [
-            _likelihood([one], every, np.log(levels[part.run.piece]))[0]
-            for one, part in zip(turned, parts, strict=True)
-        ]
-        return -float(np.sum(values))
+        turned = [part._replace(run=part.run._replace(profile=profile[at])) for part, at in parts]
+        return -float(_likelihood(turned, every, np.log(levels).ravel())[0])
 
-    first = np.zeros(shape.shape[1])
-    return np.asarray(
-        shape @ scipy.optimize.minimize(unlikely, first, method="BFGS", options={"maxiter": 20}).x + beside
-    )
+    found = scipy.optimize.minimize(unlikely, np.zeros(shape.shape[1]), method="BFGS", options={"maxiter": 20})
+    return np.asarray(shape @ found.x + beside)
 
 
 def _of_noise(model: RecordModel) -> float:

@@ -467,7 +467,9 @@ def worth(fit: RecordFit, normal: Array | None = None) -> Array:
     With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
     """
     rise = joint_worth(fit, normal)
-    return np.array([rise(one) for one in np.eye(fit.model.m, dtype=bool)])
+    value = np.array([rise(one) for one in np.eye(fit.model.m, dtype=bool)])
+    value[fit.model.m - fit.static :] = np.inf  # they stand for all modes above the lines
+    return value
 
 
 def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArray[np.bool_]], float]:

@@ -115,7 +115,7 @@ def test_without_positions_nothing_is_told_of_a_table():
 
 @pytest.mark.parametrize(("tolerance", "told"), [(0.0, 1), (0.02, 0)])
 def test_base_sensors_that_differ_are_told_beyond_their_tolerance(tolerance, told, tmp_path):
-    read = (BaseSensor("near", 0.98, 0.02), BaseSensor("far", 1.02, 0.02))
+    read = (BaseSensor("near", 0.98, 0.02 / 0.98), BaseSensor("far", 1.02, 0.02 / 1.02))
     test = dataclasses.replace(spectra(0.0), base_sensors=read, base_gain_std=tolerance)
     result = sysid.identify(Problem(test), rng=0)
     result = sysid.load(result.save(tmp_path / "result.h5"))
@@ -132,3 +132,9 @@ def test_supports_that_move_apart_speak_against_a_misfit_alone(slope, severity):
     supports = [one for one in found(test) if one.kind in ("supports differ", "base sensors")]
     assert [(one.kind, one.severity) for one in supports] == [("supports differ", severity)]
     assert supports[0].numbers["most"] == pytest.approx(0.06)
+
+
+def test_base_sensors_that_differ_by_gains_alone_are_no_supports():
+    read = tuple(BaseSensor(name, gain, abs(1 - 1 / gain)) for name, gain in (("west", 0.85), ("east", 1.15)))
+    kinds = [one.kind for one in found(dataclasses.replace(spectra(0.0), base_sensors=read))]
+    assert "base sensors" in kinds and "supports differ" not in kinds

@@ -18,7 +18,7 @@ POLE = 2 * np.pi * np.array([12.3, 31.0]) * np.exp(1j * (np.pi / 2 + np.arcsin([
 
 
 def test_a_pole_under_hann_is_its_impulse_response_times_the_autocorrelation_of_the_window() -> None:
-    """By numbers: the window's autocorrelation by Fourier's theorem, the transform by the trapezoidal rule."""
+    """By numbers: the window's autocorrelation by Fourier's theorem, the transform by Simpson's rule."""
     n = 1 << 15
     window = scipy.signal.get_window("hann", n)
     own = np.fft.irfft(np.abs(np.fft.rfft(window, 2 * n)) ** 2)[:n]

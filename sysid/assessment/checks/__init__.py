@@ -56,4 +56,5 @@ OF_THE_END: tuple[Check, ...] = (
     model_error.beyond_noise,
     search_end.no_solution,
 )  # whether a search ended at a fit
-QUICK: tuple[Check, ...] = (*CHECKS[:4], *OF_THE_END, *CHECKS[CHECKS.index(search_end.search_notes) :])
+_OF_RECORDS, _NOTES = CHECKS[: CHECKS.index(search_end.stopped)], CHECKS[CHECKS.index(search_end.search_notes) :]
+QUICK: tuple[Check, ...] = (*_OF_RECORDS, *OF_THE_END, *_NOTES)

@@ -191,7 +191,7 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
     plain, left = (_beside(one, beside) for one in (free, both))
     noise = records.noise(left, 2 * extra + beside.shape[1] * left.shape[1], least=EXACT)
     gained = float(np.sum(plain**2) - np.sum(left**2))
-    # Of less than half of what is left beside, noise and errors of channels are the larger ones.
+    # What is smaller than half of what remains may be noise, or errors of channels.
     if gained > max(noise * beyond_chance(extra, CANDIDATES), float(np.sum(left**2)) / 4):
         share = float(np.sqrt(gained / records.size))
         yield Finding(
@@ -295,7 +295,7 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
     if test.freq.size < 2 or not (test.averaged or test.has_unit_runs):
         return
     peaks = _peaks(test, structure)
-    fewest = 1.5 if test.window == "taken off" else _FEWEST
+    fewest = _least_lines(test, _FEWEST)
     coarse = peaks.spacing * fewest > peaks.width
     averaged = "" if test.averaged else "if these spectra are averages over segments, "
     groups = _found_twice(peaks, coarse, structure)
@@ -314,17 +314,23 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
     missed = "" if test.averaged else _missed(test, structure, float(peaks.frequency[k]), float(peaks.width[k]))
     if missed is None:
         return
-    seconds = _FEWEST / float(peaks.width[k])
+    seconds = fewest / float(peaks.width[k])
+    why = "their window flattens its peak" if fewest == _FEWEST else "noise at one line makes its peak"
     yield Finding(
         "coarse lines", Severity.CONTRADICTS,
         f"lines are {peaks.spacing[k]:.2g} Hz apart, mode {peaks.number[k]} is {peaks.width[k]:.2g} Hz wide{missed}: "
-        f"{averaged}their window flattens its peak, and damping and masses come out wrong",
+        f"{averaged}{why}, and damping and masses come out wrong",
         f"take whole records (from_time with estimator='records'), or segments of {seconds:.3g} s or longer",
         numbers={
             "mode": float(peaks.number[k]), "spacing": float(peaks.spacing[k]), "width": float(peaks.width[k]),
             "seconds": seconds,
         },
     )  # fmt: skip
+
+
+def _least_lines(test: Measurement, under_window: float) -> float:
+    """Lines that a half-power width holds at least; without what a window makes of peaks, more than one line of it."""
+    return 1.5 if test.window == "taken off" else under_window
 
 
 def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
@@ -340,7 +346,7 @@ def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Findi
     f, width = f[inside], 2 * ratios[inside] * f[inside]
     spacing = np.interp(f, test.freq, np.gradient(test.freq))
     k = int(np.argmax(spacing / width))
-    if 2 * np.count_nonzero(width < _RESOLVED * spacing) >= f.size:
+    if 2 * np.count_nonzero(width < _least_lines(test, _RESOLVED) * spacing) >= f.size:
         yield Finding(
             "short segments", Severity.CONTRADICTS,
             f"the segments are too short: lines are {spacing[k]:.2g} Hz apart ({1 / spacing[k]:.3g} s a segment), and "

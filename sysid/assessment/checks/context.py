@@ -255,7 +255,8 @@ class Context:
 
         Beside one named before the search averages over segments are looked at all the same, for their leakage.
         """
-        if not self.is_judged or self.has("bounds", "supports differ", "table rocks", "soft bracket"):
+        heavy = any(one.kind == "supports differ" and one.severity != Severity.NOTE for one in self.found)
+        if not self.is_judged or heavy or self.has("bounds", "table rocks", "soft bracket"):
             return True
         return bool(self.named) and not self.problem.screened.measurement.averaged
 

@@ -173,9 +173,9 @@ def base_sensors(context: Context) -> Iterator[Finding]:
 
 
 def _unlike(test: Measurement, severity: Severity, most: float = 0.02) -> Iterator[Finding]:
-    """What no gain makes of one motion is more than `most` of what a sensor reads."""
+    """The finding, where what no gain explains is more than `most` of what a sensor reads."""
     read = test.base_sensors
-    each = [float(np.sqrt(max(one.off**2 - (one.gain - 1) ** 2, 0.0))) for one in read]
+    each = [float(np.sqrt(max(one.off**2 - (1 - 1 / one.gain) ** 2, 0.0))) for one in read]
     if max(each, default=0.0) > most:
         shares = ", ".join(f"{one.name} by {100 * share:.2g} %" for one, share in zip(read, each, strict=True))
         yield Finding(
@@ -189,6 +189,7 @@ def _unlike(test: Measurement, severity: Severity, most: float = 0.02) -> Iterat
 
 
 def _differ(modal: ModalEstimate) -> Iterator[Finding]:
+    """The finding, where a gain is off by more than is usual and than its tolerance."""
     read, tolerance = modal.given.base_sensors, 0.0
     if modal.calibration is not None:
         tolerance = float(np.max(modal.calibration.tolerance[modal.given.n_sensors :][: modal.given.n_base]))
