@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
-from sysid.modal_analysis.model_order import at_static_pole, least_worth, misses_modes_above
+from sysid.modal_analysis.model_order import at_static_pole, in_gauge, least_worth, misses_modes_above
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     TRIAL,
@@ -105,7 +105,7 @@ def with_couplings(
         return fit
     alone = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     if alone is None:
-        return more if model.force else fit  # which weighs the modes, so that couplings are symmetric
+        return in_gauge(more) if model.force else fit  # which weighs the modes, so that couplings are symmetric
     return replace(more, parameters=alone)
 
 

@@ -51,7 +51,7 @@ class CoupledLines(RecordModel):
         with np.errstate(divide="ignore"):
             of_outputs = np.array([channels for _, channels, _ in weights]) ** -2.0
         self.levels = np.hstack([of_outputs, np.zeros((len(runs), self.d))])
-        self._place(static, 0, gains=gains, coupled=True)
+        self._place(static, 0, gains=gains, coupled=True, across=False)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
         """No traces: plain spectra have none."""

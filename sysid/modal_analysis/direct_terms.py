@@ -135,37 +135,50 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
     """The test without what Hann's window makes of its poles; as it is where none was stated.
 
     Until that moves no line by more than `near` of its deviation. Poles whose half-power width is less than the
-    distance of lines are noise at some line, which a narrow peak would be made of. Where its lines are no even ones, it
-    is no test of functions or shows no poles, the window counts among its errors.
+    distance of lines may be noise at one line: what the window makes of these, and by what the last round still moved,
+    counts among the errors. So does all that it blurs, where lines are no even ones, no test of functions, show no
+    poles, or are explained worse without it, as where they are not all lines of the blocks.
     """
     if test.window != "hann":
         return test
     spacing = float(np.diff(test.freq).min()) if test.freq.size > 1 else np.inf
     even = np.allclose(test.freq / spacing, np.round(test.freq / spacing), atol=0.01)
     turned = test = replace(test, window="taken off")
+    lefts: list[float] = []
+    last, rest = np.zeros(1), np.zeros(1)
     try:
         for _ in range(rounds if even and test.has_unit_runs else 0):
             beside = beside_poles(turned)
             if beside is None:
                 break
             wide = beside.at.ratios * beside.at.omega > np.pi * spacing
-            off = _by_window(turned, beside.at.omega, beside.at.ratios, wide, spacing)
+            (off, narrow), left = _by_window(turned, beside.at.omega, beside.at.ratios, wide, spacing)
             force = None if test.force is None else test.force - off[:, test.n_sensors :]
             before, turned = turned, replace(test, response=test.response - off[:, : test.n_sensors], force=force)
             size = 1e-3 * np.abs(test.response) if test.response_std is None else test.response_std
+            lefts, rest, last = [*lefts, left], np.abs(narrow) + np.abs(off - last), off
             if np.all(np.abs(turned.response - before.response) < near * size):
                 break
     except (InputError, np.linalg.LinAlgError):
-        turned = test
-    if turned is not test:
-        return turned
-    pairs = (test.response_std, test.response), (test.force_std, test.force)
-    of_window = [None if std is None or H is None else np.hypot(std, blurred(H)) for std, H in pairs]
-    return replace(test, window="", response_std=of_window[0], force_std=of_window[1])
+        lefts = []
+    if not lefts or lefts[-1] > lefts[0]:
+        rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
+        turned = replace(test, window="")
+    of_response, of_force = np.split(np.abs(rest), [test.n_sensors], axis=1)
+    of_window = [
+        None if std is None else np.hypot(std, error)
+        for std, error in ((test.response_std, of_response), (test.force_std, of_force))
+    ]
+    return replace(turned, response_std=of_window[0], force_std=of_window[1])
 
 
-def _by_window(test: Measurement, omega: Array, ratios: Array, some: NDArray[np.bool_], spacing: float) -> ComplexArray:
-    """What the window adds to `some` poles in responses and force, (runs, channels, n_freq), by residues at all."""
+def _by_window(
+    test: Measurement, omega: Array, ratios: Array, some: NDArray[np.bool_], spacing: float
+) -> tuple[ComplexArray, float]:
+    """What the window adds to `some` poles, and to the others, in responses and force, (2, runs, channels, n_freq).
+
+    And the sum of squares that the residues at all poles leave, in units of the noise.
+    """
     every = np.concatenate([test.response] + ([] if test.force is None else [test.force]), axis=1)
     deviations = (test.response_std, test.response), (test.force_std, test.force)
     stds = [np.ones(H.shape) if std is None else std for std, H in deviations if H is not None]
@@ -180,13 +193,16 @@ def _by_window(test: Measurement, omega: Array, ratios: Array, some: NDArray[np.
     x = test.freq / test.freq[-1]
     columns = np.concatenate([plain, np.stack([x**0 + 0j, 1j * x, x**2 + 0j])])
     size = np.sqrt(np.mean(np.abs(columns) ** 2, axis=1))
-    off, weights = np.zeros(every.shape, complex), 1 / np.concatenate(stds, axis=1)
+    off, left, std = np.zeros((2, *every.shape), complex), 0.0, np.concatenate(stds, axis=1)
+    weights = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
     for at in np.ndindex(every.shape[:2]):
         weight = weights[at]
         rows, data = weight * columns / size[:, None], weight * every[at]
         found = np.linalg.lstsq(np.hstack([rows.real, rows.imag]).T, np.hstack([data.real, data.imag]), rcond=None)[0]
-        off[at] = np.where(np.tile(some, 2), (found / size)[: len(plain)], 0.0) @ (hann - plain)
-    return off
+        left += float(np.sum(np.abs(data - found @ rows) ** 2))
+        for which, added in zip((some, ~some), off, strict=True):
+            added[at] = np.where(np.tile(which, 2), (found / size)[: len(plain)], 0.0) @ (hann - plain)
+    return off, left
 
 
 @one_thread()

@@ -281,7 +281,7 @@ def _least(fit: RecordFit) -> NDArray[np.bool_]:
     value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
     value[m - fit.static :] = np.inf
     first, *others = np.argsort(value, kind="stable")
-    gone = (np.arange(m) == first) & (value < least) & (m > 1)
+    gone = (np.arange(m) == first) & (value < least) & (m - fit.static > 1)
     for k in others[:-1]:
         more = gone | (np.arange(m) == k)
         if value[k] >= least or rise(more) >= least:

@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -131,7 +132,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     gained = 2 * (more.likelihood - fit.likelihood)
     if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
-    return _in_gauge(_with_poles_above(more, monitor))
+    return in_gauge(_with_poles_above(more, monitor))
 
 
 def misses_modes_above(fit: RecordFit) -> bool:
@@ -191,16 +192,29 @@ def _rise(fit: RecordFit) -> tuple[float, Array]:
     return worth, (alone @ (alone.T @ gradient[at:]) / size[at:]).reshape(n, d)
 
 
-def _in_gauge(fit: RecordFit) -> RecordFit:
+def in_gauge(fit: RecordFit) -> RecordFit:
     """The same fit, its static modes turned into each other to the form that `held_gauge` keeps."""
     p, d = fit.parameters, fit.static
+    if not d:
+        return fit
     last = p.modes.at(slice(-d, None))
     gauge = held_gauge(last, np.ones(d), fit.model.force)[0]
     phi = last.phi @ last.gamma @ np.linalg.inv(gauge)
     modes = p.modes._replace(
         phi=np.hstack([p.modes.phi[:, :-d], phi]), gamma=np.vstack([p.modes.gamma[:-d], gauge])
     )  # fmt: skip
-    return replace(fit, parameters=replace(p, modes=modes))
+    coupling = p.coupling
+    if coupling is not None:
+        turn = scipy.linalg.block_diag(np.eye(len(coupling) - d), gauge @ np.linalg.inv(last.gamma))
+        coupling = turn @ coupling @ turn.T
+    return replace(fit, parameters=replace(p, modes=modes, coupling=coupling))
+
+
+def without_static_modes(fit: RecordFit, *, monitor: FitMonitor) -> RecordFit:
+    """The fit without its static modes, for an answer whose modes are all its own."""
+    if not fit.static or fit.stopped:
+        return fit
+    return refitted(fit, without(fit, np.arange(fit.model.m) >= fit.model.m - fit.static), monitor=monitor, static=0)
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:

@@ -90,13 +90,13 @@ class RecordModel(SpectralModel):
             traces = np.concatenate([np.ones((*own.shape[:2], self.whole.of_sampling), bool), own], axis=2)
             self.held[self.kept + self.n_ends : self.coupling.start] = ~traces.ravel()
 
-    def _place(self, static: int, traces: int, *, gains: bool, coupled: bool) -> None:
-        """Set where the unknowns stand; `traces` is how many a channel and run has."""
+    def _place(self, static: int, traces: int, *, gains: bool, coupled: bool, across: bool = True) -> None:
+        """Set where the unknowns stand: `traces` a channel and run; couplings with static modes, alike, if `across`."""
         test, m = self.test, self.m
         self.traces, self.n_ends = traces, m * 2 * len(self.moving)
         before = self.kept + self.n_ends + test.n_runs * self.channels * traces
         self.coupled = pairs_of(m, both=not self.force) if coupled else np.zeros((0, 2), dtype=int)
-        self.coupled = self.coupled[np.min(self.coupled, axis=1) < m - static]  # static ones stand at one pole
+        self.coupled = self.coupled[np.sort(self.coupled, axis=1)[:, 0 if across else 1] < m - static]
         self.coupling = slice(before, before + len(self.coupled))
         self.of_laws = slice(self.coupling.stop, self.coupling.stop + sum(law.form.size for law in self.laws))
         self.of_gains = slice(self.of_laws.stop, self.of_laws.stop + self.by_gains.shape[2])

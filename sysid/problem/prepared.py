@@ -22,7 +22,7 @@ from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests, follow_ampl
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
-from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes
+from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes, without_static_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
@@ -239,7 +239,7 @@ class Prepared(SearchSpace):
         monitor.keep(fit)
         try:
             with monitor.at_work():
-                more = with_static_modes(fit, monitor=monitor) if self.answers_in_band else fit
+                more = (with_static_modes if self.answers_in_band else without_static_modes)(fit, monitor=monitor)
         except (Stop, KeyboardInterrupt):
             more = replace(fit, stopped=True)
         if count is not None:

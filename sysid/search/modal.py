@@ -316,8 +316,8 @@ def modal_structure(
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     """The modes of the structure, and those beyond the lines, which stand for all that are there."""
     inside = problem.of_structure(end.modes.omega)
-    others = end.modes.at(~inside)
-    residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, end.static)
+    others, static = end.modes.at(~inside), 0 if np.all(inside) else end.static
+    residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, static)
     return end.modes.at(inside), residual
 
 

@@ -14,7 +14,7 @@ from sysid.modal_analysis.direct_terms import under_hann, without_window
 
 SECONDS = 12.0  # three lines in a half-power width
 FREQ = np.arange(48, 600) / SECONDS
-POLE = 2 * np.pi * np.array([12.3, 31.0]) * np.exp(1j * (np.pi / 2 + np.arcsin([0.01, 0.004])))
+RATIOS = (0.01, 0.004)
 
 
 def test_a_pole_under_hann_is_its_impulse_response_times_the_autocorrelation_of_the_window() -> None:
@@ -23,7 +23,8 @@ def test_a_pole_under_hann_is_its_impulse_response_times_the_autocorrelation_of_
     window = scipy.signal.get_window("hann", n)
     own = np.fft.irfft(np.abs(np.fft.rfft(window, 2 * n)) ** 2)[:n]
     time = np.arange(n) * SECONDS / n
-    for pole, found in zip(POLE, under_hann(FREQ, POLE, SECONDS), strict=True):
+    poles = 2 * np.pi * np.array([12.3, 31.0]) * np.exp(1j * (np.pi / 2 + np.arcsin(RATIOS)))
+    for pole, found in zip(poles, under_hann(FREQ, poles, SECONDS), strict=True):
         inside = own / own[0] * np.exp(np.subtract.outer(pole, 2j * np.pi * FREQ)[:, None] * time)
         np.testing.assert_allclose(found, scipy.integrate.simpson(inside, x=time, axis=1), rtol=2e-4)
 
@@ -45,15 +46,16 @@ def test_simulated_h1_of_white_noise_is_the_closed_form_and_not_the_plain_one() 
     assert off[1] > 5 * off[0]
 
 
-def functions(late: float = 0.0):
+def functions(late: float = 0.0, ratios: tuple[float, float] = RATIOS, noise: float = 0.002):
     """Two sensors and a force under Hann's window: the test as an analyser has it, and the true one without."""
-    rng, omega, zeta = np.random.default_rng(1), np.abs(POLE), -POLE.real / np.abs(POLE)
+    rng, omega, zeta = np.random.default_rng(1), 2 * np.pi * np.array([12.3, 31.0]), np.array(ratios)
+    pole = omega * np.exp(1j * (np.pi / 2 + np.arcsin(zeta)))
     phi, gamma = np.array([[1.0, 0.5], [1.5, -0.7]]), np.array([1.1, 0.6])
-    residue = -(POLE**2) / (2j * POLE.imag)
+    residue = -(pole**2) / (2j * pole.imag)
     hann = [
         r * a + r.conj() * b - 1
         for r, a, b in zip(
-            residue, under_hann(FREQ, POLE, SECONDS), under_hann(FREQ, POLE.conj(), SECONDS), strict=True
+            residue, under_hann(FREQ, pole, SECONDS), under_hann(FREQ, pole.conj(), SECONDS), strict=True
         )
     ]
     w = 2 * np.pi * FREQ
@@ -63,13 +65,13 @@ def functions(late: float = 0.0):
         H = 1 + (phi * gamma) @ g
         H[1] *= np.exp(-1j * w * late)
         F = 10 + gamma**2 @ g
-        size = [0.002 * np.hypot(np.abs(one), 1.0) for one in (H, F)]
-        noise = (rng.standard_normal((3, FREQ.size, 2)) @ [1, 1j]) / np.sqrt(2)
+        size = [noise * np.hypot(np.abs(one), 1.0) for one in (H, F)]
+        drawn = (rng.standard_normal((3, FREQ.size, 2)) @ [1, 1j]) / np.sqrt(2)
         tests.append(
             sysid.Measurement.from_frf(
                 FREQ,
-                H + noise[:2] * size[0],
-                force=(F + noise[2] * size[1])[None, None],
+                H + drawn[:2] * size[0],
+                force=(F + drawn[2] * size[1])[None, None],
                 rigid_body=np.ones((2, 1)),
                 response_std=size[0][:, None],
                 force_std=size[1][None, None],
@@ -115,3 +117,28 @@ def test_uneven_lines_keep_the_window_among_their_errors_and_the_word_is_stored(
     assert without_window(replace(given, window="")).window == ""
     with pytest.raises(sysid.InputError, match="window"):
         sysid.Measurement.from_frf(FREQ, given.response[0], rigid_body=np.ones((2, 1)), window="flat top")
+
+
+def test_lines_that_are_not_all_of_their_blocks_keep_what_the_window_blurs_among_their_errors() -> None:
+    given = functions()[0]
+    thin = given.at(np.arange(given.freq.size) % 2 == 0)
+    turned = without_window(thin)
+    assert turned.window == ""
+    np.testing.assert_array_equal(turned.response, thin.response)
+    np.testing.assert_allclose(turned.response_std**2, thin.response_std**2 + blurred(thin.response) ** 2)
+
+
+def test_what_the_window_makes_of_a_pole_narrower_than_a_line_counts_among_the_errors() -> None:
+    """Against true functions: errors over deviations, which without that are some tens."""
+    given, true, *_ = functions(ratios=(0.01, 0.001), noise=2e-4)
+    turned = without_window(given)
+    off = np.abs(turned.response - true.response)
+    assert np.max(off / given.response_std) > 10
+    assert np.sqrt(np.mean((off / turned.response_std) ** 2)) < 2
+
+
+def test_a_zero_among_functions_is_no_reason_to_keep_the_window() -> None:
+    given = functions()[0]
+    H, std = given.response.copy(), given.response_std.copy()
+    H[0, 0, 5] = std[0, 0, 5] = 0.0
+    assert without_window(replace(given, response=H, response_std=std)).window == "taken off"

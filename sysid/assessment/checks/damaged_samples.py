@@ -11,6 +11,7 @@ from sysid.assessment.checks.context import Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Kind, Severity
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.record_fit import RecordFit
 
 
 def damaged_channels(context: Context) -> Iterator[Finding]:
@@ -34,8 +35,8 @@ def _tones(modal: ModalEstimate, beyond: float = 6.0) -> Iterator[Finding]:
         sine = fit.parameters.traces[..., 3 + 2 * at : 5 + 2 * at]
         turns = np.maximum(np.abs(np.sin(np.pi * tone * n / whole.sample_rate)), 1e-11 * n)  # see `of_tone`
         size = np.hypot(*np.moveaxis(sine, 2, 0)) * whole.sample_rate / turns
-        times, share = size / (noise * np.sqrt(2 / n)), size / rms
-        if np.max(times) > beyond:
+        times, share = size / (noise * np.sqrt(2 / n)), size / (np.sqrt(2) * rms)
+        if np.max(times) > beyond and not _rings(fit, tone):
             run, channel = np.unravel_index(np.argmax(np.where(times > beyond, share, 0.0)), share.shape)
             count = int(np.count_nonzero(np.any(times > beyond, axis=0)))
             others = f", the largest of {count} channels" * (count > 1)
@@ -47,6 +48,13 @@ def _tones(modal: ModalEstimate, beyond: float = 6.0) -> Iterator[Finding]:
                 int(run) + 1, names[channel],
                 {"value": tone, "size": float(share[run, channel]), "channels": float(count)},
             )  # fmt: skip
+
+
+def _rings(fit: RecordFit, tone: float) -> bool:
+    """True where a mode within a line of a tone decays so slowly that it rings all along the record, as a tone does."""
+    modes, line = fit.parameters.modes, float(np.max(fit.model.whole.spacing))
+    f = modes.omega / (2 * np.pi)
+    return bool(np.any((np.abs(f - tone) < line) & (2 * modes.ratios * f < line)))
 
 
 def _of_test(modal: ModalEstimate) -> Iterator[Finding]:

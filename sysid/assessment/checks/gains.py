@@ -175,16 +175,18 @@ def base_sensors(context: Context) -> Iterator[Finding]:
 def _unlike(test: Measurement, severity: Severity, most: float = 0.02) -> Iterator[Finding]:
     """The finding, where what no gain explains is more than `most` of what a sensor reads."""
     read = test.base_sensors
-    each = [float(np.sqrt(max(one.off**2 - (1 - 1 / one.gain) ** 2, 0.0))) for one in read]
-    if max(each, default=0.0) > most:
+    # v = g t + r, r across t, and |v - t| = off |v|: the share |r| / |v|.
+    squares = [1 - one.gain**2 * (1 - one.off**2) / (2 * one.gain - 1) if one.gain > 0.5 else 0.0 for one in read]
+    each = np.sqrt(np.maximum(squares, 0.0)) if read else np.zeros(0)
+    if np.max(each, initial=0.0) > most:
         shares = ", ".join(f"{one.name} by {100 * share:.2g} %" for one, share in zip(read, each, strict=True))
         yield Finding(
             "supports differ", severity,
             f"{len(read)} base sensors differ from the motion that is taken for that of the base, not by gains alone "
-            f"({shares} of what they read): the base bends or turns, or its supports move apart",
+            f"({shares} of what they read): the base bends or turns, its supports move apart, or they are noisy",
             "state how else the base moves where it turns (base_axes, such as \"x rz\"); supports that each move for "
             "themselves move alike below some frequency: end the lines there (band)",
-            numbers={"sensors": float(len(read)), "most": max(each)},
+            numbers={"sensors": float(len(read)), "most": float(np.max(each))},
         )  # fmt: skip
 
 
