@@ -47,7 +47,8 @@ def test_hum_of_one_channel_is_fitted_and_told_as_a_note():
     result, (found,) = identified(every)
     assert (found.kind, found.severity, found.channel) == ("tone", Severity.NOTE, "sensor 1")
     assert found.numbers["value"] == pytest.approx(6.3, abs=0.02 * RATE / N)
-    assert (found.numbers["channels"], found.numbers["size"]) == (1, pytest.approx(0.2, abs=0.02))
+    size = np.sqrt(0.02 / 1.02)  # a sine of 0.2 beside an rms of one
+    assert (found.numbers["channels"], found.numbers["size"]) == (1, pytest.approx(size, abs=0.01))
     assert result.judgement == "determined"
     np.testing.assert_allclose(result.structure.mass, TRUTH.mass, atol=0.02 * 5)
 
