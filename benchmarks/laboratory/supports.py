@@ -42,10 +42,11 @@ def lines(reduced: bool) -> Iterator[Line]:
     for what, mine in (("apart", every[::2]), ("as one", every[1::2])):
         found = [one for one in mine if "said" not in one]
         named = sum(one["named"] for one in found)
-        text = f"{len(mine)} tests whose supports move {what}: named"
-        yield above(f"{text}, share", named / len(mine), SHARE) if what == "apart" else below(text, named, 0)
+        tests = f"{len(mine)} tests whose supports move {what}"
+        share = above(f"{tests}: named, share", named / len(mine), SHARE)
+        yield share if what == "apart" else below(f"{tests}: named", named, 0)
         wrong = [one["accused"][0] for one in found if one["accused"]]
-        yield below(f"{text[:-7]}: right records accused ({'; '.join(wrong[:3])})", len(wrong), 0)
+        yield below(f"{tests}: right records accused ({'; '.join(wrong[:3])})", len(wrong), 0)
 
 
 def figures(number: int) -> dict[str, Any]:

@@ -187,8 +187,8 @@ class RecordFit:
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
-            "varying": self.model.whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": self.model.whole.plain, "grows": whole.grows,
+            "varying": whole.varying, "kept": self.kept, "coupling": p.coupling,
+            "gains": p.gains, "plain": whole.plain, "grows": whole.grows,
             "profile": getattr(whole, "profile", None), "taken": whole.taken if whole.grows else None,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
