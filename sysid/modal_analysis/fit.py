@@ -268,7 +268,7 @@ def _same_modes(modes: Modes, poles: Poles | Modes) -> bool:
     return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
 
 
-def _pruned(fit: RecordFit, monitor: FitMonitor, *, limits: Limits = WHOLE) -> RecordFit:
+def _pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
     """The fit without modes that noise explains, several together where noise explains them all."""
     while np.any(least := _least(fit)):
         fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
@@ -385,10 +385,13 @@ def _of_lines(
 def _calibrated(
     fit: RecordFit, stated: Calibration, monitor: FitMonitor | None
 ) -> tuple[RecordFit, Calibration]:  # fmt: skip
-    """The fit once more without the errors of gains that it makes likely within tolerances."""
+    """The fit once more without the errors of gains that it makes likely within tolerances.
+
+    And without modes that stood for them.
+    """
     found = calibration_of(fit, stated)
     try:
-        return on_turned(fit, found.taken_off(fit.test), monitor=monitor), found
+        return _pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor), found
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True), stated
 

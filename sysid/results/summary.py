@@ -188,6 +188,11 @@ def _towards_a_fit(it: Answer) -> list[str]:
             "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
             "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * tables.runs_can_be_left_out(it)
         ]
+        if not it.structure.laws and any(one.numbers.get("trend") for one in it.of_kind("changing")):
+            steps.append(
+                "or let the mode follow its amplitude, which whole records tell: sysid run test.h5 --amplitude "
+                "(Problem(..., amplitude=AmplitudeLaw(modes=[1])))"
+            )
     # A goal is of accelerations: it takes no force for explained.
     if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:
         return steps

@@ -203,8 +203,8 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
         )
     x = answer.x if answer.x.size else None
     left = objective_of(problem, structure, x)
-    ended = Phase("local phase", left, answer.x, session.seconds, answer.curve.size)
-    history = History(local=left, local_curve=answer.curve, phases=(ended,))
+    phases = (Phase("local phase", left, answer.x, session.seconds, answer.curve.size),)
+    history = History(local=left, local_curve=answer.curve, phases=phases)
     session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {history.local:.4e}")
     success, message, stopped = answer.success, answer.message, answer.stopped
     if stopped is not None:
@@ -215,10 +215,7 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
 
 
 def fit_records_as_asked(problem: Prepared, options: Modal, monitor: AbstractContextManager[FitMonitor]) -> bool:
-    """Fit whole records with the modes that are asked for and those that stand for all above the lines.
-
-    False where nothing is to be done.
-    """
+    """Fit whole records with the modes asked for and those that stand for all above; False where none are to be."""
     count = _modes_asked(problem, options)
     if not (problem.modal[0].by_modes and (count is not None or problem.answers_in_band)):
         return False
@@ -235,9 +232,10 @@ def _left_out(problem: Prepared, structure: Structure, count: int | None) -> tup
         return ()
     ours, (first, last) = 2 * np.pi * structure.natural_frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
     others = found.omega[~modes_within(found.omega, ours, ours) & (found.omega >= first) & (found.omega <= last)]
+    if not others.size:
+        return ()
     which = ", ".join(f"{w / (2 * np.pi):.5g}" for w in others)
-    sentence = f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out"
-    return (search_note(sentence),) * bool(which)
+    return (search_note(f"asked for {count} of the modes: what stands out of the data at {which} Hz too is left out"),)
 
 
 def _in_unknowns(
@@ -315,10 +313,16 @@ def modal_structure(
 
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
     """The modes of the structure, and those beyond the lines, which stand for all that are there."""
-    inside = problem.of_structure(end.modes.omega)
-    others, static = end.modes.at(~inside), 0 if np.all(inside) else end.static
-    residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, static)
+    inside, others = _by_frequency(problem, end)
+    beyond, static = end.modes.at(others), end.static if others.size else 0
+    residual = ResidualModes(beyond.omega / (2 * np.pi), beyond.ratios, beyond.phi, beyond.gamma, static)
     return end.modes.at(inside), residual
+
+
+def _by_frequency(problem: Prepared, end: ModalFit) -> tuple[Integers, Integers]:
+    """Numbers of the modes of the structure by frequency, as a fit may move one past another; and of residual ones."""
+    inside, order = problem.of_structure(end.modes.omega), np.argsort(end.modes.omega, kind="stable")
+    return order[inside[order]], np.flatnonzero(~inside)
 
 
 def _coupling(problem: Prepared, end: ModalFit) -> tuple[Array | None, Array | None]:
@@ -326,11 +330,9 @@ def _coupling(problem: Prepared, end: ModalFit) -> tuple[Array | None, Array | N
     modal = problem.modal[0]
     if modal.coupling is None:
         return None, None
-    index, inside = index_of(modal), problem.of_structure(end.modes.omega)
-    step = theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index)
-    found = modal.coupling.about(step)
-    order = np.concatenate([np.flatnonzero(inside), np.flatnonzero(~inside)])
-    return found[np.ix_(inside, inside)], found[np.ix_(~inside, order)]
+    index, (inside, others) = index_of(modal), _by_frequency(problem, end)
+    found = modal.coupling.about(theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index))
+    return found[np.ix_(inside, inside)], found[np.ix_(others, np.concatenate([inside, others]))]
 
 
 def _modes_asked(problem: Prepared, options: Modal) -> int | None:
@@ -442,10 +444,7 @@ def _free_spectrum(
 
 
 def held_by_model(problem: Prepared, structure: Structure) -> Array:
-    """Unknowns (n_variables,) of a lumped or known mass that are nearest to a modal model.
-
-    Its mass, its poles, and the orthogonal shapes nearest to its own.
-    """
+    """Unknowns (n_variables,) of a lumped or known mass with a model's poles and the shapes nearest to its own."""
     formulation = problem.formulation
     x = problem.values(structure)
     M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
@@ -465,8 +464,8 @@ def _without_pole(problem: Prepared, poles: Poles) -> str:
     stated, ends = 2 * np.pi * problem.stated.frequencies, 2 * np.pi * problem.measurement.freq[[0, -1]]
     lacking = stated[~modes_within(stated, ends, poles.omega, FREQUENCY_WINDOW)] / (2 * np.pi)
     each = ", ".join(f"{f:.5g}" for f in lacking)
-    does_not = f": of the stated natural frequencies {each} Hz does not stand out, as the base may not move this mode"
-    return does_not * bool(lacking.size)
+    said = f": of the stated natural frequencies {each} Hz does not stand out, as the base may not move this mode"
+    return said * bool(lacking.size)
 
 
 def poles_of(problem: Prepared) -> Poles:

@@ -13,7 +13,8 @@ from sysid.jobs.changes import drawn_from
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
-from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.fit import fit_modes, whole_fit
+from sysid.modal_analysis.record_fit import refitted
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import calibration_of
 
@@ -237,3 +238,18 @@ def test_what_gains_make_of_channels(records):
 def test_what_is_no_tolerance_is_refused(spectra, std):
     with pytest.raises(sysid.InputError, match="gain_std"):
         dataclasses.replace(spectra, gain_std=std)
+
+
+def test_a_mode_that_stood_for_errors_of_gains_goes_with_them(records, monkeypatch):
+    """What was worth a mode before, as a second one within the width of another, is none beside the gains."""
+    read = dataclasses.replace(misread(records, np.r_[0.005 * np.array([1, -1, 1, 2]), 0.0, 0.0]), **TOLERANCES)
+    fit = whole_fit(read)
+    modes = fit.parameters.modes
+    slow = modes.at([0])._replace(omega=0.8 * modes.omega[:1], ratios=np.array([0.9]), phi=1e-3 * modes.phi[:, :1])
+    monkeypatch.setattr(
+        "sysid.modal_analysis.fit.whole_fit",
+        lambda *_, **__: refitted(fit, dataclasses.replace(fit.parameters, modes=slow.joined(modes))),
+    )
+    found = fit_modes(read)
+    assert np.any(found.calibration.values)
+    assert np.allclose(found.modes.omega, modes.omega, rtol=1e-4)

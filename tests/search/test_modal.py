@@ -13,7 +13,7 @@ from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.stiffness_and_damping import ProportionalDamping
 from sysid.problem.prepared import Prepared
-from sysid.search import modal_program
+from sysid.search import modal, modal_program
 from sysid.search.modal import degrees_of_freedom
 from sysid.search.session import DeferredInterrupt, Session
 
@@ -78,6 +78,21 @@ def test_noise_is_fitted_to_its_floor(seed):
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
     assert result.success
     assert result.residual == pytest.approx(test.residual(truth), rel=0.05)
+
+
+def test_modes_that_passed_one_another_in_the_fit_keep_their_own_damping(monkeypatch):
+    """The structure numbers its modes by frequency, whatever their order where the fit ends."""
+    true = structure(0, 4, 2)
+    test = sysid.simulate(true, lines(true), noise=0.01, force=True, rng=0)
+    ended = modal.ended
+
+    def moved(*given):
+        return dataclasses.replace(end := ended(*given), modes=end.modes.at([2, 0, 3, 1]))
+
+    monkeypatch.setattr(modal, "ended", moved)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
+    assert result.structure.damping_ratios == pytest.approx(true.damping_ratios, rel=0.05)
+    assert result.residual < 0.011
 
 
 def test_given_frequencies_do_not_matter_and_seeds_neither():

@@ -205,7 +205,7 @@ class Change:
             f"{rises} as the motion grows, from {first.frequency:.4g} Hz at {self._motion(first.level)} to "
             f"{last.frequency:.4g} Hz at {self._motion(last.level)} of the sensor that it moves most: the structure "
             f"{softens}, and no linear model holds at all levels",
-            "fit runs of the level of interest",
+            "let it follow its amplitude, or fit runs of the level of interest",
         )
 
     def _motion(self, level: float) -> str:
