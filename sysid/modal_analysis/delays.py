@@ -34,6 +34,7 @@ from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import stacked
+from sysid.modal_analysis.vector_fitting import GUESS
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT, ROUND_OFF, UNEXPLAINED, beyond_chance, most_deviations
@@ -177,13 +178,13 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     # What late channels leave at peaks passes for spikes as long as they are late.
     kept = [np.isin(lines.freq, at.test.freq) for at in [one for _, one in far] or [beside]]
     still = _joined(lines.at(np.all(kept, axis=0)))
-    first = _Late(still, clocks, np.zeros(none.values.size), beside.at.poles)
-    complex_ = _Late(still, clocks, first.delays, beside.at.poles, complex_residues=True)
+    first = _with_one_above(_Late(still, clocks, np.zeros(none.values.size), beside.at.poles))
+    complex_ = _Late(still, clocks, first.delays, first.poles, complex_residues=True)
     if not far and first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
     end = _settled(first)
     for delays, at in far:
-        other = _settled(_Late(still, clocks, delays, at.at.poles))
+        other = _settled(_with_one_above(_Late(still, clocks, delays, at.at.poles)))
         end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
     # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
@@ -353,6 +354,18 @@ class _Late:
         """Sum of squares of the delays that one step finds, in units of their errors."""
         _, delays, covariance = self.step()
         return float(delays @ np.linalg.pinv(covariance, hermitian=True) @ delays)
+
+
+def _with_one_above(fit: _Late, above: float = 1.3) -> _Late:
+    """The fit with one more pole, so far above the lines, where that explains more.
+
+    Complex residues of poles in the lines stand for a mode close above them, and real ones do not: what these leave of
+    it looks like delays.
+    """
+    poles = fit.poles.reshape(2, -1)
+    beyond = np.log([[2 * np.pi * above * fit.test.freq[-1]], [GUESS]])
+    more = _Late(fit.still, fit.clocks, fit.delays, np.hstack([poles, beyond]).ravel(), fit.complex_residues)
+    return more if more.explains_more_than(fit) else fit
 
 
 def _of_runs(test: Measurement, records: Records) -> Array:
