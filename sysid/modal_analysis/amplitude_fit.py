@@ -86,7 +86,9 @@ def _stages(
         for found in _with_law_of(best, mode, stated.exponents, tries, limits, monitor):
             if not best.parameters.laws:  # further laws are judged alone, at their end
                 yield found, linear
-        found = _judged(found, best if best.parameters.laws else linear, since=len(best.parameters.laws))
+            found = _judged(found, best if best.parameters.laws else linear, since=len(best.parameters.laws))
+            if stated.modes == "auto" and best.parameters.laws and not found.parameters.laws[-1].likelier:
+                break  # no exponents make a law of what gains nothing with the first
         law = fitted_laws(found)[-1]
         if law.is_certain:
             best = found
