@@ -204,7 +204,7 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
         help="of TEST.h5: tolerance of the gains of all channels, base and force included, as a standard deviation, "
         "such as 0.005; those that the sensors' list states, exact where it states none",
     )  # fmt: skip
-    run.add_argument("--amplitude", action="store_true", default=None, help="of TEST.h5: mode 1 follows its amplitude")
+    run.add_argument("--amplitude", action="store_true", default=None, help="of TEST.h5: modes follow their amplitude")
     run.add_argument(
         "--at-rest", action="store_true", default=None,
         help="of TEST.h5: all records begin and end at rest, as they were recorded without a window, and have no "

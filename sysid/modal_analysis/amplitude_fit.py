@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Literal
 
@@ -33,8 +33,11 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 def with_laws(
     fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], *, monitor: FitMonitor,
     much: float = 0.1, tries: tuple[float, ...] = (0.0, 0.03),
-) -> RecordFit:  # fmt: skip
-    """The fit with laws of the stated modes, numbered from 1 by frequency within the lines.
+) -> tuple[RecordFit, tuple[FittedLaw, ...]]:  # fmt: skip
+    """The fit with laws of the stated modes, numbered from 1 by frequency within the lines, and laws that do not pay.
+
+    Laws come mode by mode, each of exponents of its own. One that the likelihood takes stands in the fit as the next is
+    tried; one that it does not is left out of it. "auto" goes on from the first mode where that has a law.
 
     Where the linear model misses `much`, by what `left_of` gives, what it misses passes for noise of the base, which
     then explains any law: squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these
@@ -43,26 +46,30 @@ def with_laws(
     Raises
     ------
     InputError
-        Where there is no such mode.
+        Where there is no such mode, or two of them are one.
     """
     stages: list[tuple[RecordFit, RecordFit]] = []
+    rest: list[FittedLaw] = []
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            for stage in _stages(fit, stated, left_of, monitor, much, tries):
+            for stage in _stages(fit, stated, left_of, rest, monitor, much, tries):
                 stages.append(stage)
     except (Stop, KeyboardInterrupt):
         so_far = _judged(*stages[-1]) if stages else fit
         likelier = any(law.likelier for law in so_far.parameters.laws)
-        return replace(so_far if likelier else fit, stopped=True)
-    return _judged(*stages[-1])
+        return replace(so_far if likelier else fit, stopped=True), tuple(rest)
+    return _judged(*stages[-1]), tuple(rest)
 
 
 def _stages(
-    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], monitor: FitMonitor, much: float,
-    tries: tuple[float, ...],
+    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], rest: list[FittedLaw],
+    monitor: FitMonitor, much: float, tries: tuple[float, ...],
 ) -> Iterator[tuple[RecordFit, RecordFit]]:  # fmt: skip
-    """The likeliest fit with laws so far, and the linear one that it is judged by, better from stage to stage."""
+    """The likeliest fit with laws so far, and the linear one that it is judged by, better from stage to stage.
+
+    Laws that do not pay are added to `rest`.
+    """
     whole = fit.model.whole
     plain = left_of(fit) > much or whole.plain
     whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
@@ -70,45 +77,76 @@ def _stages(
     if plain:
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
-    numbers, alone = _modes_of(linear, stated), linear
+    modes, best = _modes_of(linear, stated), linear
     if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
-        alone = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
-    first = (OF_FREQUENCY[0], OF_DAMPING[0]) if stated.exponents == "auto" else stated.exponents
-    monitor.doing = "a law of amplitude"
+        best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
-    best = _started(alone, numbers, first, tries, limits, monitor)
-    yield best, linear
-    if stated.exponents == "auto":
-        best = _likeliest(best, "of_frequency", OF_FREQUENCY[1:], limits, monitor)
-        yield best, linear
-        best = _likeliest(best, "of_damping", OF_DAMPING[1:], limits, monitor)
-        yield best, linear
-    if plain:
+    for mode in modes:
+        found = best
+        for found in _with_law_of(best, mode, stated.exponents, tries, limits, monitor):
+            if not best.parameters.laws:  # further laws are judged alone, at their end
+                yield found, linear
+            found = _judged(found, best if best.parameters.laws else linear, since=len(best.parameters.laws))
+            if stated.modes == "auto" and best.parameters.laws and not found.parameters.laws[-1].likelier:
+                break  # no exponents make a law of what gains nothing with the first
+        law = fitted_laws(found)[-1]
+        if law.is_certain:
+            best = found
+            yield best, linear
+        else:
+            rest.append(law)
+        if stated.modes == "auto" and not best.parameters.laws:
+            break
+    if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
-    if plain and left_of(best) < much:
-        monitor.doing = "noise of all channels"
-        noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
-        best, linear = (
-            refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
-            for p in (_with_equivalents(best), linear.parameters)
-        )
+        if left_of(best) < much:
+            monitor.doing = "noise of all channels"
+            noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
+            best, linear = (
+                refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
+                for p in (_with_equivalents(best), linear.parameters)
+            )
     yield best, linear
 
 
-def _judged(best: RecordFit, linear: RecordFit) -> RecordFit:
-    """The fit, whose laws are told to be likelier than the linear fit of the same records, or not, beyond chance.
+def _with_law_of(
+    best: RecordFit, mode: int, exponents: tuple[float, float] | Literal["auto"], tries: tuple[float, ...],
+    limits: Limits, monitor: FitMonitor,
+) -> Iterator[RecordFit]:  # fmt: skip
+    """The fit with a law of one more mode, likelier from one to the next."""
+    which = f"a law of amplitude near {best.parameters.modes.omega[mode] / (2 * np.pi):.3g} Hz"
+    monitor.doing = which
+    before = best.parameters.laws[-1].form[:2] if best.parameters.laws else (OF_FREQUENCY[0], OF_DAMPING[0])
+    first = before if exponents == "auto" else exponents
+    best = _started(best, mode, first, tries, limits, monitor)
+    yield best
+    kinds: tuple[Literal["of_frequency", "of_damping"], ...] = ("of_frequency", "of_damping")
+    for kind, each in zip(kinds, (OF_FREQUENCY, OF_DAMPING), strict=True) if exponents == "auto" else ():
+        for exponent in (one for one in each if one != first[kinds.index(kind)]):
+            monitor.doing = f"{which}, exponent {exponent:g} {kind.replace('_', ' ')}"
+            found = refitted(best, _with_exponent(best, kind, exponent), limits=limits, monitor=monitor)
+            if found.likelihood > best.likelihood:
+                best = found
+        yield best
+
+
+def _judged(best: RecordFit, without: RecordFit, since: int = 0) -> RecordFit:
+    """The fit, whose laws `since` one are told to be likelier than the fit without these, or not, beyond chance.
 
     Squares take the base as exact, and what its noise does at a few lines near a peak passes for what a law does: there
     the gain must also be beyond its scatter from line to line (Vuong, Econometrica 57 (1989) 307-333).
     """
-    numbers = sum(law.form.size for law in best.parameters.laws)
-    gained = 2 * (best.likelihood - linear.likelihood) / _shared(best)
+    p = best.parameters
+    if not p.laws:
+        return best
+    numbers = sum(law.form.size for law in p.laws[since:])
+    gained = 2 * (best.likelihood - without.likelihood) / _shared(best)
     likelier = gained > beyond_chance(numbers, len(OF_FREQUENCY) + len(OF_DAMPING))
     if likelier and best.model.whole.plain:
-        each = _of_lines(best) - _of_lines(linear)
+        each = _of_lines(best) - _of_lines(without)
         likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
-    laws = tuple(law._replace(likelier=likelier) for law in best.parameters.laws)
-    return replace(best, parameters=replace(best.parameters, laws=laws))
+    judged = tuple(law._replace(likelier=likelier) for law in p.laws[since:])
+    return replace(best, parameters=replace(p, laws=(*p.laws[:since], *judged)))
 
 
 def _of_lines(fit: RecordFit) -> Array:
@@ -121,77 +159,78 @@ def _of_lines(fit: RecordFit) -> Array:
 
 
 def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
-    """Numbers of the stated modes among those of a fit."""
-    omega = fit.parameters.modes.omega
+    """Numbers of the modes that are to have a law among those of a fit."""
+    p = fit.parameters
+    omega, ratios = p.modes.omega, p.modes.ratios
     inside = np.flatnonzero(modes_within(omega, 2 * np.pi * fit.test.freq[[0, -1]], np.zeros(0)))
-    order = inside[np.argsort(omega[inside], kind="stable")]
-    if max(stated.modes) > order.size:
+    order = inside[np.argsort(omega[inside], kind="stable")].tolist()
+    numbers = range(1, len(order) + 1) if stated.modes == "auto" else stated.modes
+    if max(numbers, default=1) > len(order):
         raise InputError(
-            f"AmplitudeLaw: mode {max(stated.modes)} is to follow its amplitude, and the records show {order.size} "
-            "modes within their lines: state the number of one of these"
+            f"AmplitudeLaw: mode {max(numbers, default=1)} is to follow its amplitude, and the records show "
+            f"{len(order)} modes within their lines: state the number of one of these"
         )
-    return [int(order[mode - 1]) for mode in stated.modes]
+    found: list[int] = []
+    for number in numbers:
+        k = order[number - 1]
+        # A frame that changes shows twice near one frequency, of one shape: with a law one of the two is nothing.
+        one = [other for other in found if _are_one(omega[[k, other]], ratios[[k, other]], p.modes.phi[:, [k, other]])]
+        if one and stated.modes != "auto":
+            raise InputError(
+                f"AmplitudeLaw: mode {number}, {omega[k] / (2 * np.pi):.4g} Hz, and mode {order.index(one[0]) + 1}, "
+                f"{omega[one[0]] / (2 * np.pi):.4g} Hz, are one mode that changes, by frequency and shape: state one"
+            )
+        found += [] if one else [k]
+    return found
+
+
+def _are_one(omega: Array, ratios: Array, shapes: Array, alike: float = 0.9) -> bool:
+    """True of two modes of one shape, nearer than their half-power widths together; `alike` is the assurance of it."""
+    a, b = shapes.T
+    near = abs(omega[1] - omega[0]) < 2 * float(ratios @ omega)
+    return bool(near and len(a) > 1 and (a @ b) ** 2 > alike * (a @ a) * (b @ b))
 
 
 def _started(
-    linear: RecordFit, numbers: list[int], exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
+    fit: RecordFit, mode: int, exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
     monitor: FitMonitor,
 ) -> RecordFit:  # fmt: skip
-    """Laws of these exponents, from the first of some falls of the frequency that settles, else from the likeliest."""
-    p = linear.parameters
-    found = []
+    """A law more of these exponents, from the first of some falls of the frequency that settles, else the likeliest."""
+    p, found = fit.parameters, []
+    sensor = int(np.argmax(np.abs(p.modes.phi[:, mode])))
+    form, followed = LawForm(*exponents, _levels(fit, mode, sensor)[1]), np.arange(fit.model.m) == mode
+    ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
     for fall in tries:
-        laws = []
-        for k in numbers:
-            sensor = int(np.argmax(np.abs(p.modes.phi[:, k])))
-            form = LawForm(*exponents, _levels(linear, k, sensor)[1])
-            laws.append(ModeLaw(k, sensor, form, np.array([fall, 0.0]), np.ones((linear.test.n_runs, 2))))
-        followed = np.isin(np.arange(linear.model.m), numbers)
+        law = ModeLaw(mode, sensor, form, np.array([fall, 0.0]), np.ones((fit.test.n_runs, 2)))
         modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + fall / 2, 1.0))
-        ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
-        found.append(
-            refitted(linear, replace(p, modes=modes, ends=ends, laws=tuple(laws)), limits=ROUGH, monitor=monitor)
-        )
+        begun = replace(p, modes=modes, ends=ends, laws=(*p.laws, law))
+        found.append(refitted(fit, begun, limits=ROUGH, monitor=monitor))
         if found[-1].settled:
             break
     best = max(found, key=lambda one: one.likelihood)
     return refitted(best, _with_equivalents(best), limits=limits, monitor=monitor)
 
 
-def _likeliest(
-    best: RecordFit, which: Literal["of_frequency", "of_damping"], exponents: Sequence[float], limits: Limits,
-    monitor: FitMonitor,
-) -> RecordFit:  # fmt: skip
-    """The likeliest of a fit and of those with other exponents."""
-    for exponent in exponents:
-        monitor.doing = f"a law of amplitude, exponent {exponent:g} {which.replace('_', ' ')}"
-        found = refitted(best, _with_exponent(best, which, exponent), limits=limits, monitor=monitor)
-        if found.likelihood > best.likelihood:
-            best = found
-    return best
-
-
 def _with_exponent(fit: RecordFit, which: Literal["of_frequency", "of_damping"], exponent: float) -> Parameters:
-    """The parameters with another exponent of the laws, which say what they said at two levels.
+    """The parameters with another exponent of the last law, which says what it said at two levels.
 
     One is exceeded most of the time, one hardly ever: from other values damping may be zero at all low levels, where
     no step shows.
     """
-    p, laws = _with_equivalents(fit), []
-    omega, ratios = p.modes.omega.copy(), p.modes.ratios.copy()
-    for law in p.laws:
-        unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
-        number, values, pole = ("of_frequency", "of_damping").index(which), law.values.copy(), [1.0, 1.0]
-        before, after = unit ** getattr(law.form, which), unit**exponent
-        values[number] *= (before[1] - before[0]) / (after[1] - after[0])
-        beside = law.values[number] * before[1] - values[number] * after[1]  # what is left is of any level
-        pole[number] = max(1 + beside / ratios[law.mode], 0.1) if number else 1 - beside
-        values[0] /= pole[0]
-        omega[law.mode] *= pole[0]
-        ratios[law.mode] *= pole[1]
-        form = law.form._replace(**{which: exponent})
-        laws.append(law._replace(form=form, values=values, equivalent=law.equivalent / pole))
-    return replace(p, modes=p.modes._replace(omega=omega, ratios=ratios), laws=tuple(laws))
+    p = _with_equivalents(fit)
+    law, omega, ratios = p.laws[-1], p.modes.omega.copy(), p.modes.ratios.copy()
+    unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
+    number, values, pole = ("of_frequency", "of_damping").index(which), law.values.copy(), [1.0, 1.0]
+    before, after = unit ** getattr(law.form, which), unit**exponent
+    values[number] *= (before[1] - before[0]) / (after[1] - after[0])
+    beside = law.values[number] * before[1] - values[number] * after[1]  # what is left is of any level
+    pole[number] = max(1 + beside / ratios[law.mode], 0.1) if number else 1 - beside
+    values[0] /= pole[0]
+    omega[law.mode] *= pole[0]
+    ratios[law.mode] *= pole[1]
+    form = law.form._replace(**{which: exponent})
+    law = law._replace(form=form, values=values, equivalent=law.equivalent / pole)
+    return replace(p, modes=p.modes._replace(omega=omega, ratios=ratios), laws=(*p.laws[:-1], law))
 
 
 def _shared(fit: RecordFit) -> float:

@@ -438,11 +438,11 @@ def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw | None, monitor:
         return modal
     monitor.begin(1)
     with one_thread():
-        found = with_laws(fit, stated, left_of, monitor=monitor)
+        found, rest = with_laws(fit, stated, left_of, monitor=monitor)
         laws = fitted_laws(found)
         if any(law.is_certain for law in laws) or found.stopped:
-            return estimate(found, modal.calibration)
-    return replace(modal, laws=laws)
+            modal = estimate(found, modal.calibration)
+    return replace(modal, laws=(*laws, *rest))
 
 
 def without_transients(fit: RecordFit) -> Measurement:

@@ -259,8 +259,7 @@ class ModalEstimate:
         inner = np.linalg.pinv(A[np.ix_(~ours, ~ours)] / np.outer(size, size), hermitian=True) / np.outer(size, size)
         turn = np.eye(ours.size)[ours]
         turn[:, ~ours] = -A[np.ix_(ours, ~ours)] @ inner
-        nearest = (int(np.argmin(np.abs(np.log(self.omega / (2 * np.pi * law.frequency))))) for law in self.laws)
-        laws = tuple(law for law, mode in zip(self.laws, nearest, strict=True) if kept[mode])
+        laws = tuple(law for law in self.laws if kept[law.mode_among(self.omega / (2 * np.pi), np.inf)])
         coupling = self.coupling and self.coupling.at(kept, ours, inner, A[np.ix_(~ours, ours)])
         return replace(
             self, coupling=coupling, laws=laws, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,

@@ -34,11 +34,12 @@ class AmplitudeLaw:
 
     Parameters
     ----------
-    modes : sequence of int
-        Numbers of these modes, from 1, by frequency within the lines.
+    modes : sequence of int or "auto"
+        Numbers of these modes, from 1, by frequency within the lines; "auto" takes the first and, where it follows its
+        amplitude, each further one that is likelier with a law than without.
     exponents : (float, float) or "auto"
         Of the fall of the frequency (1/2, 1 or 2) and of the rise of the damping ratio (-1, as of friction, 1/2, 1 or
-        2) with the level; "auto" takes the likeliest.
+        2) with the level; "auto" takes the likeliest of each mode.
 
     Examples
     --------
@@ -46,15 +47,16 @@ class AmplitudeLaw:
     AmplitudeLaw(modes=(1,), exponents='auto')
     """
 
-    modes: Sequence[int] = (1,)
+    modes: Sequence[int] | Literal["auto"] = "auto"
     exponents: tuple[float, float] | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.modes, list | tuple) or not self.modes:
-            raise InputError(f"AmplitudeLaw: modes = {self.modes!r}; give numbers of modes, from 1: modes=[1]")
-        modes = tuple(whole_number("AmplitudeLaw: a mode", mode, at_least=1) for mode in self.modes)
-        refuse((len(set(modes)) < len(modes), f"AmplitudeLaw: modes = {list(modes)} names a mode twice"))
-        object.__setattr__(self, "modes", modes)
+        if self.modes != "auto":
+            if not isinstance(self.modes, list | tuple) or not self.modes:
+                raise InputError(f"AmplitudeLaw: modes = {self.modes!r}; give 'auto', or numbers from 1: modes=[1]")
+            modes = tuple(whole_number("AmplitudeLaw: a mode", mode, at_least=1) for mode in self.modes)
+            refuse((len(set(modes)) < len(modes), f"AmplitudeLaw: modes = {list(modes)} names a mode twice"))
+            object.__setattr__(self, "modes", modes)
         if isinstance(self.exponents, str) and self.exponents == "auto":
             return
         sound = isinstance(self.exponents, list | tuple) and len(self.exponents) == 2
@@ -70,15 +72,17 @@ class AmplitudeLaw:
     def to_tree(self) -> dict[str, Any]:
         """Give the fields; `from_tree` takes them back."""
         return {
-            "modes": np.array(self.modes),
+            "modes": None if self.modes == "auto" else np.array(self.modes),
             "exponents": None if self.exponents == "auto" else np.array(self.exponents),
         }
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> AmplitudeLaw:
         """What a tree of `to_tree` stands for."""
-        exponents = tree["exponents"]
-        return cls(tree["modes"].tolist(), "auto" if exponents is None else tuple(exponents.tolist()))
+        modes, exponents = tree["modes"], tree["exponents"]
+        return cls(
+            "auto" if modes is None else modes.tolist(), "auto" if exponents is None else tuple(exponents.tolist())
+        )
 
 
 class LawForm(NamedTuple):
@@ -146,6 +150,23 @@ class FittedLaw:
         unit = self.values / size
         away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
         return self.likelier and away > beyond_chance(self.values.size)
+
+    def mode_among(self, frequencies: Array, within: float = 0.1) -> int:
+        """Index of its mode among those of a structure, Hz: the nearest, `within` this share of its frequency.
+
+        Raises
+        ------
+        InputError
+            Where none is so near.
+        """
+        apart = np.abs(frequencies / self.frequency - 1)
+        k = int(np.argmin(apart))
+        if apart[k] > within:
+            raise InputError(
+                f"laws: the structure has no mode near {self.frequency:.4g} Hz, which the law is of (the nearest is "
+                f"{frequencies[k]:.4g} Hz): leave the law out (with_laws), or keep its mode"
+            )
+        return k
 
     def at(self, level: float) -> tuple[float, float]:
         """Frequency, Hz, and damping ratio at a level, m/s²."""

@@ -181,8 +181,8 @@ class Structure:
         return other
 
     def mode_of(self, law: FittedLaw) -> int:
-        """Index of the mode that a law is of: the nearest in frequency."""
-        return int(np.argmin(np.abs(np.log(self.natural_frequencies / law.frequency))))
+        """Index of the mode that a law is of; an `InputError` where it is gone."""
+        return law.mode_among(self.natural_frequencies)
 
     def at_level(self, level: float) -> Structure:
         """The linear structure that moves as this one does where its modes with a law move at a level, m/s².

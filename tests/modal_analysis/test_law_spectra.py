@@ -10,7 +10,7 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.modal_analysis.amplitude_fit import _envelopes, _with_exponent
+from sysid.modal_analysis.amplitude_fit import _envelopes, _modes_of, _with_exponent
 from sysid.modal_analysis.fit import fit_modes, follow_amplitude
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
@@ -24,11 +24,14 @@ GAMMA = PHI.T @ np.ones(2)
 STEPS = 12  # of a sample
 
 
-def moved(base, *, law=True):
-    """Absolute accelerations by a Runge-Kutta method of fourth order, the base band-limited."""
+def moved(base, *, law=True, both=False):
+    """Absolute accelerations by a Runge-Kutta method of fourth order, the base band-limited.
+
+    With `both` the second mode falls too, by the first power of its level.
+    """
     n = base.size * STEPS
-    both = scipy.signal.resample(base, 2 * n)
-    fine, middle = both[::2], both[1::2]
+    halves = scipy.signal.resample(base, 2 * n)
+    fine, middle = halves[::2], halves[1::2]
     h, size = 1 / (RATE * STEPS), np.abs(PHI[:, 0]).max()
 
     def slope(y, u):
@@ -39,6 +42,11 @@ def moved(base, *, law=True):
                 level = size * w[0] * np.hypot(w[0] * q[0], v[0]) / LEVEL
                 w[0] = OMEGA[0] * (1 - FALL * np.sqrt(level))
             zeta[0] = RATIOS[0] + RISE * level
+        if both:
+            for _ in range(8):
+                level = np.abs(PHI[:, 1]).max() * w[1] * np.hypot(w[1] * q[1], v[1]) / LEVEL
+                w[1] = OMEGA[1] * (1 - FALL * level)
+            zeta[1] = RATIOS[1] + RISE * level
         return np.array([v, -2 * zeta * w * v - w**2 * q - GAMMA * u])
 
     y, out = np.zeros((2, 2)), []
@@ -62,11 +70,11 @@ def shaken(level, seed, samples=1200):
     return level * base / base.std() * np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
 
 
-def test_of(levels, *, law=True, noise=0.005, seed=0, samples=1200):
+def test_of(levels, *, law=True, both=False, noise=0.005, seed=0, samples=1200):
     rng, runs = np.random.default_rng(seed), []
     for number, level in enumerate(levels):
         base = shaken(level, 10 * seed + number, samples)
-        response = moved(base, law=law)
+        response = moved(base, law=law, both=both)
         noisy = response + noise * response.std(axis=1, keepdims=True) * rng.standard_normal(response.shape)
         runs.append((base[None] + noise * base.std() * rng.standard_normal(base.size), noisy, None))
     sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x") for i in (1, 2)]
@@ -122,6 +130,35 @@ def test_the_law_is_found_within_its_deviations(answer):
     assert [one.kind for one in answer.findings].count("amplitude law") == 1
     assert not any(one.kind == "changing" for one in answer.findings)
     assert np.allclose(answer.structure.natural_frequencies, [3.0, 8.0], rtol=2e-3)
+    assert [one.numbers["mode"] for one in answer.findings if one.kind == "linear"] == [2.0]  # tried too
+
+
+def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
+    problem = sysid.Problem(test_of((0.3, 3.0), both=True), amplitude=sysid.AmplitudeLaw())
+    answer = sysid.identify(problem, rng=0)
+    first, second = answer.structure.laws
+    assert (first.form[:2], second.form[:2]) == ((0.5, 1.0), (1.0, 1.0))
+    for law, mode, exponent in ((first, 0, 0.5), (second, 1, 1.0)):
+        scale = LEVEL / law.form.level
+        truth = [*np.log([OMEGA[mode] / (2 * np.pi), RATIOS[mode]]), FALL * scale**-exponent, RISE / scale]
+        found = np.concatenate([np.log([law.frequency, law.ratio]), law.values])
+        assert np.all(np.abs(found - truth) < 5 * np.sqrt(np.diag(law.covariance)))
+    assert [one.numbers["mode"] for one in answer.findings if one.kind == "amplitude law"] == [1.0, 2.0]
+    assert [one["mode"] for one in answer.to_dict()["amplitude_laws"]] == [1, 2]
+    again = sysid.load(answer.save(tmp_path / "result.h5"))
+    assert [law.at(2.0) for law in again.structure.laws] == [law.at(2.0) for law in answer.structure.laws]
+    assert again.problem.amplitude == sysid.AmplitudeLaw()
+
+
+def test_a_mode_that_shows_twice_has_one_law(test):
+    fit = record_modes(test, np.append(OMEGA, 1.01 * OMEGA[0]), np.append(RATIOS, RATIOS[0]))
+    omega, ratios, phi = np.append(OMEGA, 1.01 * OMEGA[0]), np.append(RATIOS, RATIOS[0]), PHI[:, [0, 1, 0]]
+    modes = fit.parameters.modes._replace(omega=omega, ratios=ratios, phi=phi)
+    fit = replace(fit, parameters=replace(fit.parameters, modes=modes))
+    with pytest.raises(sysid.InputError, match="one mode that changes"):
+        _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 2]))
+    assert _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 3])) == [0, 1]
+    assert _modes_of(fit, sysid.AmplitudeLaw()) == [0, 1]
 
 
 def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(test, answer):

@@ -1,5 +1,7 @@
 """A mode whose frequency and damping follow its amplitude, against an independent integrator and differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -108,6 +110,11 @@ def test_at_a_level_the_mode_has_the_frequency_and_damping_of_the_law(linear):
     assert np.array_equal(there.mass, linear.mass)
     assert np.allclose(there.participation, linear.participation)
     assert there.laws == ()
+
+
+def test_a_law_of_a_mode_that_is_gone_is_refused(linear):
+    with pytest.raises(sysid.InputError, match="no mode near 7 Hz"):
+        linear.with_laws([replace(law(), frequency=7.0)])
 
 
 def test_two_laws_of_one_mode_are_refused(linear):

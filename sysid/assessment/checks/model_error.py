@@ -258,7 +258,8 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     if not context.modal.laws:
         sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
-    for mode, law in zip(asked.modes, context.modal.laws, strict=False):
+    for law in context.modal.laws:
+        mode = law.mode_among(context.modal.omega / (2 * np.pi), np.inf) + 1
         low, high = law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
