@@ -63,6 +63,8 @@ class Stretch(NamedTuple):
     frequency, std : (m,)
         Hz, and its standard deviation, roughly, from what is left about its peak: too small by some times where a
         stretch has only a few lines there.
+    ratio, ratio_std : (m,)
+        Damping ratio, and its standard deviation likewise.
     level : (m,)
         Root mean square of what each mode makes of the acceleration of the sensor that it moves most, m/s² (see
         `sysid.measurement.in_time.levels_are_known`).
@@ -75,6 +77,8 @@ class Stretch(NamedTuple):
     end: float
     frequency: Array
     std: Array
+    ratio: Array
+    ratio_std: Array
     level: Array
     left: float
     left_by_all: float
@@ -125,11 +129,11 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     N = fit.normal[np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
     m, f = modes.omega.size, modes.omega / (2 * np.pi)
-    variance = (
-        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(fit)
-    )
-    std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
-    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(fit), _left(fit), _left(held))
+    variance = (unit**2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True)))[: 2 * m].reshape(2, m)
+    variance *= _noise_at_peaks(fit) / 2
+    std = np.sqrt(np.where(variance > 0, variance, np.inf)) * [f, modes.ratios]  # inf: round-off, a mode shows nowhere
+    of_poles = f, std[0], modes.ratios, std[1]
+    return Stretch(piece.number, piece.start, piece.end, *of_poles, _levels(fit), _left(fit), _left(held))
 
 
 def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:

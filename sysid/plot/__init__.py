@@ -9,6 +9,7 @@ Measured is thin and dark, identified dashed and coloured above it, their differ
 
 from sysid.plot.comparison import comparison, minima
 from sysid.plot.plots import (
+    amplitude,
     base_force,
     base_forces,
     cmif,
@@ -24,6 +25,6 @@ from sysid.plot.plots import (
 )
 
 __all__ = [
-    "base_force", "base_forces", "cmif", "comparison", "convergence", "effective_masses", "mac", "matrices", "minima",
-    "mode_shapes", "overview", "responses", "stabilisation", "transmissibility",
+    "amplitude", "base_force", "base_forces", "cmif", "comparison", "convergence", "effective_masses", "mac",
+    "matrices", "minima", "mode_shapes", "overview", "responses", "stabilisation", "transmissibility",
 ]  # fmt: skip

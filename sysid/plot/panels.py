@@ -1,4 +1,4 @@
-"""Panels: measured against identified spectra, the stabilisation diagram, the complex mode indicator function."""
+"""Panels: measured and identified spectra, stabilisation diagram, complex mode indicator function, laws."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
+from sysid.modal_analysis.stretches import Stretch
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.plot.canvas import (
     COLOURS,
     FAINT,
+    GRID,
     IDENTIFIED,
     INK,
     MEASURED,
@@ -26,6 +28,7 @@ from sysid.plot.canvas import (
     positive,
 )  # fmt: skip
 from sysid.results.identification import Identification
+from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import LIKELY, ROUND_OFF
 
@@ -362,6 +365,31 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
         _remark(ax, f"Singular values of the runs' own spectra: {reason}.")
     dress(ax, "Complex mode indicator function", "frequency [Hz]", f"singular value{unit}")
     legend_below(ax, ax.get_lines(), 4)
+
+
+def draw_law(row: Sequence[Axes], law: FittedLaw, mode: int, stretches: Sequence[tuple[Stretch, int]]) -> None:
+    """Frequency and damping of a law into two axes, beside those of stretches, each with the mode's index there."""
+    low, high = law.levels
+    seen = [(one, k) for one, k in stretches if one.std[k] < one.ratio[k] * one.frequency[k]]  # others tell nothing
+    at = np.array([np.sqrt(2) * one.level[k] for one, k in seen])
+    of_stretches = np.array([
+        ((one.frequency[k], one.std[k]), (100 * one.ratio[k], 100 * one.ratio_std[k])) for one, k in seen
+    ]).reshape(-1, 2, 2)  # fmt: skip
+    levels = np.geomspace(low / 1.5, 1.2 * high, 120)
+    values = np.array([law.at(level) for level in levels]).T * [[1], [100]]
+    reach = LIKELY * np.array([law.deviations_at(level) for level in levels]).T * [[1], [100]]
+    for ax, value, width, points, what in zip(
+        row, values, reach, of_stretches.transpose(1, 2, 0), ("frequency [Hz]", "damping ratio [%]"), strict=True
+    ):
+        ax.axvspan(low, high, color=GRID, alpha=0.6, zorder=0, label="levels tested")
+        ax.plot(levels, value, color=IDENTIFIED["color"], linewidth=1.6, label="law")
+        ax.fill_between(levels, value - width, value + width, **{**_BAND, "label": "its 95 % interval"})
+        style: Any = {"color": INK, "markersize": 4, "linewidth": 0.9, "label": "stretches of the records, 95 %"}
+        ax.errorbar(at, points[0], LIKELY * points[1], fmt="o", **style)
+        ax.set_xscale("log")
+        ax.set_xlim(levels[0], levels[-1])
+        plain_log(ax.xaxis)
+        dress(ax, f"Mode {mode}", "", what)
 
 
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import HUBER
+from sysid.modal_analysis.stretches import stretches_of
 from sysid.plot.canvas import (
     COLOURS,
     FAINT,
@@ -30,6 +31,7 @@ from sysid.plot.canvas import (
 from sysid.plot.panels import (
     draw,
     draw_cmif,
+    draw_law,
     draw_stabilisation,
     force_channel,
     key,
@@ -389,6 +391,31 @@ def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
     target, ax = new_axes(ax, 6.4, 3.8)
     draw_cmif(ax, subject)
     return target
+
+
+def amplitude(identification: Identification) -> Figure:
+    """Frequency and damping ratio of the modes that follow their amplitude, against their level; a row a mode.
+
+    Curves are the law with its 95 % interval, over the levels tested, which are shaded, and a little beyond. Points are
+    linear modes of stretches of the fitted records, each at the level of its mean square. Where the level changes
+    within a stretch, its damping ratio is too large: one pole takes a frequency that wanders for damping.
+
+    Raises
+    ------
+    InputError
+        Where no mode follows its amplitude.
+    """
+    structure, modal = identification.structure, identification.modal[0]
+    refuse((not structure.laws, "amplitude: no mode of this result follows its amplitude"))
+    stretches = stretches_of(modal.given, modal.omega, modal.ratios)
+    figure = new_figure(9.0, 3.4 * len(structure.laws))
+    for row, law in zip(figure.subplots(len(structure.laws), 2, squeeze=False), structure.laws, strict=True):
+        k = int(np.argmin(np.abs(np.log(modal.omega / (2 * np.pi * law.frequency)))))
+        draw_law(row, law, structure.mode_of(law) + 1, [(one, k) for one in stretches])
+    legend_below(row[0], row[0].get_legend_handles_labels()[0], 2)
+    for ax in row:
+        ax.set_xlabel("level of the mode [m/s²]")
+    return figure
 
 
 def overview(identification: Identification, *, title: str | None = None) -> Figure:

@@ -71,6 +71,10 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_AGAINST_LEVEL = (
+    "Level: envelope of the mode's own acceleration at the sensor where its shape is largest. Points: a linear mode "
+    "fitted to each stretch of the records; where the level changes within it, its damping is too large."
+)
 _MAC_IN_NUMBERS = 12  # modes
 _NORMALISED = "~ normalised, one of many"
 
@@ -133,6 +137,7 @@ def render(identification: Identification) -> str:
         [
             ("How far to trust it", trust(it)),
             ("Modes", _modes(it)),
+            ("Amplitude", _amplitude(it)),
             ("Mode shapes", _shapes(it)),
             ("Measured against identified", _responses(it, it.measurement, level) + _residuals(it, level)),
             ("Validation", _validation(it)),
@@ -207,6 +212,13 @@ def _modes(it: Identification) -> str:
     notes += map(sentence, tables.missing_mass(it))
     head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
+
+
+def _amplitude(it: Identification) -> str:
+    """Laws of modes that follow their amplitude, beside what stretches of the records show; nothing without a law."""
+    if not it.structure.laws:
+        return ""
+    return picture(plot.amplitude(it), "frequency and damping ratio against level", _AGAINST_LEVEL)
 
 
 def _shapes(it: Identification) -> str:

@@ -14,8 +14,10 @@ import sysid
 from sysid import plot
 from sysid.finding import Finding, Severity
 from sysid.modal_analysis.stabilisation import LEVELS, cmif, stabilisation
-from sysid.plot.canvas import to_png
-from sysid.plot.panels import draw, key, response_channel, strongest
+from sysid.modal_analysis.stretches import Stretch
+from sysid.plot.canvas import new_figure, to_png
+from sysid.plot.panels import draw, draw_law, key, response_channel, strongest
+from sysid.structure.amplitude import FittedLaw, LawForm
 
 FREQ = np.linspace(1.0, 40.0, 60)
 
@@ -457,3 +459,28 @@ def test_a_notebook_can_show_a_figure_without_pyplot(unit):
 def test_importing_draws_in_neither_matplotlib_nor_a_display():
     code = "import sys, sysid.plot, sysid.report; sys.exit('matplotlib' in sys.modules or 'h5py' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_law_of_amplitude_is_drawn_for_each_mode_that_has_one_and_else_refused(unit):
+    levels = np.geomspace(1.0, 8.0, 4)
+    low, high = LawForm(0.5, 1.0, 10.0), LawForm(1.0, 1.0, 10.0)
+    laws = [
+        FittedLaw(f, 0.01, 0, form, np.array([0.1, 0.02]), (1.0, 8.0), 1e-8 * np.eye(4), True)
+        for f, form in ((3.0, low), (8.0, high))
+    ]
+    axes = new_figure(8.0, 6.0).subplots(2, 2)
+    for row, law in zip(axes, laws, strict=True):
+        f, zeta = np.array([law.at(level) for level in levels]).T
+        rms, size = levels / np.sqrt(2), np.full(1, 1e-3)
+        seen = [
+            (Stretch(0, 0.0, 1.0, f[i : i + 1], size, zeta[i : i + 1], size, rms[i : i + 1], 0.0, 0.0), 0)
+            for i in range(4)
+        ]
+        draw_law(row, law, 1, seen)
+        for ax, expected in zip(row, (f, 100 * zeta), strict=True):
+            curve, points = ax.get_lines()[:2]
+            np.testing.assert_allclose(points.get_data(), (levels, expected))
+            drawn = np.interp(np.log(levels), np.log(curve.get_xdata()), curve.get_ydata())
+            np.testing.assert_allclose(drawn, expected, rtol=1e-4)
+    with pytest.raises(sysid.InputError, match="amplitude"):
+        plot.amplitude(unit)
