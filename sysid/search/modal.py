@@ -21,7 +21,7 @@ from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_
 from sysid.finding import Finding
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate, index_of, residual_of, theta_of
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_in_band, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
@@ -287,7 +287,7 @@ def modal_structure(
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
-    modes, residual = _in_band(problem, end)
+    modes, residual, coupling, across = _in_band(problem, end)
     count = _modes_asked(problem, options)
     if count is not None and count != modes.omega.size:
         raise DoesNotApplyError(too_few(modes.omega.size, count))
@@ -300,7 +300,7 @@ def modal_structure(
         residual = residual.without_mass(problem.totals)  # nothing weighs them
     # A stated total is kept, even where the base force weighs another, but not where it misses modes below the lines.
     kept = mass.totals is not None and held is None and not later and end.modes.omega.min() >= 2 * np.pi * test.freq[0]
-    unmet, (coupling, across) = mass.free and (test.force is None or kept), _coupling(problem, end)
+    unmet = mass.free and (test.force is None or kept)
     try:
         structure = structure_of_modes(
             problem, modes, remainder, chosen, to_totals=unmet, residual=residual, coupling=coupling, across=across
@@ -313,12 +313,12 @@ def modal_structure(
         ) from None
 
 
-def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
-    """The modes of the structure, and those beyond the lines, which stand for all that are there."""
+def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes, Array | None, Array | None]:
+    """The modes of the structure, those beyond the lines, which stand for all there, and couplings of both."""
     inside = problem.of_structure(end.modes.omega)
     others, static = end.modes.at(~inside), 0 if np.all(inside) else end.static
     residual = ResidualModes(others.omega / (2 * np.pi), others.ratios, others.phi, others.gamma, static)
-    return end.modes.at(inside), residual
+    return modes_in_band(end.modes.at(inside), residual, *_coupling(problem, end))
 
 
 def _coupling(problem: Prepared, end: ModalFit) -> tuple[Array | None, Array | None]:
@@ -327,8 +327,7 @@ def _coupling(problem: Prepared, end: ModalFit) -> tuple[Array | None, Array | N
     if modal.coupling is None:
         return None, None
     index, inside = index_of(modal), problem.of_structure(end.modes.omega)
-    step = theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index)
-    found = modal.coupling.about(step)
+    found = modal.coupling.about(theta_of(end.modes, end.rigid, index) - theta_of(modal.modes, modal.rigid, index))
     order = np.concatenate([np.flatnonzero(inside), np.flatnonzero(~inside)])
     return found[np.ix_(inside, inside)], found[np.ix_(~inside, order)]
 
