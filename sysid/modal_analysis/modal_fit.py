@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, gains, stacked
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.superelement import ResidualModes, in_band
 
 # Pole of modes that stand for all above the lines: times the last line, where masses stay positive, and damping ratio.
 STATIC_POLE = 2.0, 0.01
@@ -120,6 +121,24 @@ def force_columns(gamma: Array, index: Index, i: int) -> Array:
         if i in (a, b):
             mix[m + mode.size + (b if i == a else a), column] = 1.0
     return mix
+
+
+def modes_in_band(
+    modes: Modes, residual: ResidualModes, coupling: Array | None, across: Array | None
+) -> tuple[Modes, ResidualModes, Array | None, Array | None]:
+    """Modes that dampers couple with static ones as the band shows them (`in_band`), with couplings in their terms.
+
+    Without couplings across where these are as large as the modes' own mass: no structure has them.
+    """
+    if coupling is None or across is None or not (residual.static and np.any(across)):
+        return modes, residual, coupling, across
+    m, loss = modes.omega.size, np.diag(2 * modes.ratios * modes.omega) + coupling
+    try:
+        omega, T, C = in_band(modes.omega, loss, *replace(residual, coupling=across).above(np.eye(m)))
+    except np.linalg.LinAlgError:
+        return modes, residual, coupling, None
+    told = Modes(modes.phi @ T, T.T @ modes.gamma, omega, np.diag(C) / (2 * omega))
+    return told, residual, C - np.diag(np.diag(C)), np.hstack([across[:, :m] @ T, across[:, m:]])
 
 
 def held_gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:

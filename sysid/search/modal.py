@@ -21,7 +21,7 @@ from sysid.errors import InputError, SolverError, Stop, refuse, sequence, whole_
 from sysid.finding import Finding
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate, index_of, residual_of, theta_of
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_within, separate_poles, too_few
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, modes_in_band, modes_within, separate_poles, too_few
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
@@ -285,7 +285,7 @@ def modal_structure(
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
-    modes, residual = _in_band(problem, end)
+    modes, residual, coupling, across = _in_band(problem, end)
     count = _modes_asked(problem, options)
     if count is not None and count != modes.omega.size:
         raise DoesNotApplyError(too_few(modes.omega.size, count))
@@ -298,7 +298,7 @@ def modal_structure(
         residual = residual.without_mass(problem.totals)  # nothing weighs them
     # A stated total is kept, even where the base force weighs another, but not where it misses modes below the lines.
     kept = mass.totals is not None and held is None and not later and end.modes.omega.min() >= 2 * np.pi * test.freq[0]
-    unmet, (coupling, across) = mass.free and (test.force is None or kept), _coupling(problem, end)
+    unmet = mass.free and (test.force is None or kept)
     try:
         structure = structure_of_modes(
             problem, modes, remainder, chosen, to_totals=unmet, residual=residual, coupling=coupling, across=across
@@ -311,12 +311,12 @@ def modal_structure(
         ) from None
 
 
-def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes]:
-    """The modes of the structure, and those beyond the lines, which stand for all that are there."""
+def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes, Array | None, Array | None]:
+    """The modes of the structure, those beyond the lines, which stand for all there, and couplings of both."""
     inside, others = _by_frequency(problem, end)
     beyond, static = end.modes.at(others), end.static if others.size else 0
     residual = ResidualModes(beyond.omega / (2 * np.pi), beyond.ratios, beyond.phi, beyond.gamma, static)
-    return end.modes.at(inside), residual
+    return modes_in_band(end.modes.at(inside), residual, *_coupling(problem, end))
 
 
 def _by_frequency(problem: Prepared, end: ModalFit) -> tuple[Integers, Integers]:

@@ -14,7 +14,7 @@ from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped
 from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
-from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains
+from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains, unturned
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -363,27 +363,31 @@ class Structure:
         samples = np.shape(base)[-1] if np.ndim(base) else 0
         measured = shaped_array("response", response, self.n_sensors, samples)
         left = measured - self.simulate(base, sample_rate)
-        return fitted_state(self._modal_model, self._all_shapes, left, sample_rate, self.n)
+        return fitted_state(self._modal_model, self._all_shapes, left, sample_rate, self.n) @ self._turned[1].T
 
     @property
     def _modal_model(self) -> ModalModel:
-        """The structure's own modes, then the residual ones."""
-        beyond = self.residual
-        loss = scipy.linalg.block_diag(self.modal_damping_matrix, np.diag(2 * beyond.damping_ratios * beyond.omega))
+        """The structure's own modes, turned, then the residual ones."""
+        beyond, (omega, turn, loss) = self.residual, self._turned
+        loss = scipy.linalg.block_diag(loss, np.diag(2 * beyond.damping_ratios * beyond.omega))
         if beyond.coupling is not None:
-            loss += self._across(self.normal_modes)
-        omega = np.concatenate([self._omega, beyond.omega])
-        return ModalModel(omega, loss, np.vstack([self.participation, beyond.participation]))
+            across, among = np.split(beyond.coupling, [self.n], axis=1)
+            across = across @ self.normal_modes @ turn
+            loss += np.block([[np.zeros((self.n, self.n)), across.T], [across, among]])
+        participation = np.vstack([turn.T @ self.participation, beyond.participation])
+        return ModalModel(np.concatenate([omega, beyond.omega]), loss, participation)
 
-    def _across(self, modes: Array) -> Array:
-        """Damping between residual modes and motions `modes` (n, n) of the degrees of freedom, (n + r, n + r)."""
-        across, among = np.split(np.asarray(self.residual.coupling), [self.n], axis=1)
-        return np.block([[0 * modes, (across @ modes).T], [across @ modes, among]])
+    @property
+    def _turned(self) -> tuple[Array, Array, Array]:
+        """Frequencies, turns and loss of the modes without the answer of static residual ones: `unturned`."""
+        if self.residual.coupling is None:
+            return self._omega, np.eye(self.n), self.modal_damping_matrix
+        return unturned(self._omega, self.modal_damping_matrix, *self.residual.above(self.normal_modes))
 
     @property
     def _all_shapes(self) -> Array:
         """The same modes at the sensors, (n_sensors, n + r)."""
-        return np.hstack([self.mode_shapes, self.residual.shapes])
+        return np.hstack([self.mode_shapes @ self._turned[1], self.residual.shapes])
 
     def _in_time(self, base: ArrayLike, sample_rate: float, initial: ArrayLike | None) -> tuple[Array, Array]:
         """Base acceleration and modal accelerations, (n + r, n_samples); residual modes begin at rest."""
@@ -395,7 +399,7 @@ class Structure:
         )
         state = np.zeros((2, self.n + self.residual.count))
         if initial is not None:
-            state[:, : self.n] = shaped_array("initial", initial, 2, self.n)
+            state[:, : self.n] = np.linalg.solve(self._turned[1], shaped_array("initial", initial, 2, self.n).T).T
         modal = modal_accelerations(self._modal_model, motion, rate, state)
         for law in self.laws:
             k = self.mode_of(law)
@@ -414,15 +418,12 @@ class Structure:
         """
         from scipy.signal import StateSpace
 
-        n, beyond, join = self.n, self.residual, scipy.linalg.block_diag
-        R = np.hstack([self.recovery, beyond.shapes])
-        M_inv = scipy.linalg.inv(self.mass[:n, :n])
-        spring = join(M_inv @ self.stiffness[:n, :n], np.diag(beyond.omega**2))
-        loss = join(M_inv @ self.damping, np.diag(2 * beyond.damping_ratios * beyond.omega))
-        if beyond.coupling is not None:
-            loss += join(M_inv, np.eye(beyond.count)) @ self._across(np.eye(n))
+        whole, R = self._modal_model, np.hstack([self.recovery, self.residual.shapes])
+        turn = scipy.linalg.block_diag(self.normal_modes @ self._turned[1], np.eye(self.residual.count))
+        back = np.linalg.inv(turn)
+        spring, loss = turn * whole.omega**2 @ back, turn @ whole.damping @ back
         acceleration = np.hstack([-spring, -loss])
-        feed = -np.vstack([M_inv @ self._coupling, beyond.participation])
+        feed = -turn @ whole.participation
         A = np.vstack([np.hstack([np.zeros_like(spring), np.eye(len(spring))]), acceleration])
         return StateSpace(A, np.vstack([np.zeros_like(feed), feed]), R @ acceleration, R @ feed + self.rigid_body)
 

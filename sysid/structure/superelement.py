@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, check_positive_definite, lowest_eigenvalue, refuse, shaped_array
-from sysid.structure.thresholds import EXACT
+from sysid.structure.thresholds import EXACT, ROUND_OFF
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
@@ -37,7 +37,8 @@ class ResidualModes:
         modes above the band.
     coupling : (r, n + r), optional
         Loads of these modes by velocities of the n degrees of freedom of their structure, then of themselves, where
-        dampers couple them: what stands off the diagonal of the damping; kg^1/2/s, then rad/s.
+        dampers couple them: what stands off the diagonal of the damping; kg^1/2/s, then rad/s. Static ones answer the
+        structure's modes, whose frequencies, shapes and loads are those that they have with it: see `in_band`.
 
     Raises
     ------
@@ -87,6 +88,13 @@ class ResidualModes:
         """Circular frequencies, rad/s, (r,)."""
         return 2 * np.pi * self.natural_frequencies
 
+    def above(self, modes: Array) -> tuple[Array, Array, Array]:
+        """Couplings of static modes with motions (n, m), their frequencies and loss, rad/s: (s, m), (s,), (s, s)."""
+        assert self.coupling is not None
+        at, n = slice(self.count - self.static, None), len(modes)
+        loss = np.diag(2 * self.damping_ratios * self.omega) + self.coupling[:, n:]
+        return self.coupling[at, :n] @ modes, self.omega[at], loss[at, at]
+
     def scaled(self, factor: float | Array) -> ResidualModes:
         """The same answer of the sensors, by modes of `factor`, one or (r,), times the participation."""
         participation = np.reshape(factor, (-1, 1)) * self.participation
@@ -106,6 +114,48 @@ class ResidualModes:
 def modal_gains(w: Array, omega: Array, ratios: Array) -> ComplexArray:
     """Relative acceleration of modes per unit load, ``w² / (w_k² - w² + 2 i zeta_k w_k w)``, (m, L); all in rad/s."""
     return np.asarray(w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w), dtype=complex)
+
+
+def in_band(omega: Array, loss: Array, coupling: Array, above: Array, loss_above: Array) -> tuple[Array, Array, Array]:
+    """Modes as a band shows them, of modes that dampers couple with static ones: (m,), turns T (m, m), loss (m, m).
+
+    A static mode at W answers velocities of the others, and its answer acts on them by a damper again:
+    ``w² c c' / (W² - w²)``, nearly as mass would. Its size is that of the static mode's own scale, which hardly shows.
+    So modes are told with it: those p of ``S(w) = W_m² - w² + w² c c' / (W² - w²)`` with ``S(w_k) p_k = 0`` and unit
+    mass ``-p' dS/d(w²) p``. With u = c / (W² - w_k²) the whole has, in their coordinates, the further mass W² u u', the
+    stiffness (w² u) (w² u)' and the loss (w u) z (w u)' (`unturned`): T' S T less these is ``w_k² - w²``, exactly.
+
+    Parameters
+    ----------
+    omega, loss : (m,), (m, m)
+        rad/s.
+    coupling : (r, m)
+        By dampers with the static modes, rad/s.
+    above, loss_above : (r,), (r, r)
+        Static modes, rad/s.
+    """
+    found, T = np.zeros_like(omega), np.eye(omega.size)
+    for k, w in enumerate(omega):
+        for _ in range(100):
+            mass = np.eye(omega.size) - coupling.T / (above**2 - w**2) @ coupling
+            lam, V = scipy.linalg.eigh(np.diag(omega**2), mass)
+            last, w = w, np.sqrt(lam[k])
+            if abs(w - last) <= ROUND_OFF * w:
+                break
+        u = coupling @ V[:, k] / (above**2 - w**2)
+        # V has unit mass at w, S' that of the pole.
+        size = 1 - w**2 * np.sum(u**2)
+        found[k], T[:, k] = w, V[:, k] * np.sign(V[k, k]) / np.sqrt(size)
+    moved = coupling @ T / (above[:, None] ** 2 - found**2) * found
+    return found, T, T.T @ loss @ T - moved.T @ loss_above @ moved
+
+
+def unturned(omega: Array, loss: Array, coupling: Array, above: Array, loss_above: Array) -> tuple[Array, Array, Array]:
+    """The modes that `in_band` gives those told, up to signs: (m,), turns into them (m, m), and their loss (m, m)."""
+    u = coupling / (above[:, None] ** 2 - omega**2)
+    mass, spring = above[:, None] * u, u * omega**2
+    lam, V = scipy.linalg.eigh(np.diag(omega**2) + spring.T @ spring, np.eye(omega.size) + mass.T @ mass)
+    return np.sqrt(lam), V, V.T @ (loss + (u * omega).T @ loss_above @ (u * omega)) @ V
 
 
 @dataclass(frozen=True, eq=False)

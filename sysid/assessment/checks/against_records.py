@@ -208,12 +208,8 @@ def _beside(fit: ResidueFit, columns: Array) -> Array:
     return np.asarray(fit.left - added @ (added.T @ fit.left))
 
 
-def _couplings(modal: ModalEstimate, structure: Structure, much: float = 1e-3) -> Iterator[Finding]:
-    """Dampers couple modes, and the damping matrix holds it: its share, and the coupling that stands out most.
-
-    Couplings with modes above the lines leave the poles of those within open by what they move them, where that is
-    `much` of a frequency, as much as the clocks of recorders may be off.
-    """
+def _couplings(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
+    """Dampers couple modes, and the damping matrix holds it: its share, and the coupling that stands out most."""
     found, test = modal.coupling, modal.records
     if found is None or structure.modal_damping:
         return
@@ -224,29 +220,12 @@ def _couplings(modal: ModalEstimate, structure: Structure, much: float = 1e-3) -
     values = found.values[*found.pairs.T]
     most = int(np.argmax(np.abs(values) / modal.coupling_std))
     (first, second), deviations = modal.omega[found.pairs[most]] / (2 * np.pi), values[most] / modal.coupling_std[most]
-    moved = _moved_from_above(structure)
-    above = (
-        f". Dampers couple them with modes above the lines too, which moves their poles by up to {100 * moved:.2g} %: "
-        "their own frequencies and damping ratios depend by as much on how the modes above are represented"
-    ) * (moved > much)
     yield Finding(
-        "damping", Severity.CAUTION if above else Severity.NOTE,
+        "damping", Severity.NOTE,
         f"the damping is not classical: dampers couple the modes, by {100 * share:.2g} % of the response, most surely "
-        f"those at {first:.4g} and {second:.4g} Hz ({abs(deviations):.2g} deviations); the damping matrix holds it"
-        f"{above}", "let the lines reach above these modes" * bool(above),
-        numbers={"share": share, "deviations": float(abs(deviations)), "first": float(first), "second": float(second),
-                 "moved": moved},
+        f"those at {first:.4g} and {second:.4g} Hz ({abs(deviations):.2g} deviations); the damping matrix holds it",
+        numbers={"share": share, "deviations": float(abs(deviations)), "first": float(first), "second": float(second)},
     )  # fmt: skip
-
-
-def _moved_from_above(structure: Structure) -> float:
-    """By how much couplings with residual modes move the poles of the structure's modes, the most, over their size."""
-    if structure.residual.coupling is None:
-        return 0.0
-    alone = structure.with_residual(replace(structure.residual, coupling=None))
-    both, own = (np.linalg.eigvals(one.to_state_space().A) for one in (structure, alone))
-    own = own[np.argsort(np.abs(own))][: 2 * structure.n]
-    return float(np.max(np.min(np.abs(np.subtract.outer(own, both)), axis=1) / np.abs(own)))
 
 
 def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
