@@ -103,10 +103,9 @@ def solve_modes(
         held = held | (np.arange(d) == np.argmax(np.abs(gauge), axis=1)[:, None])
         size = np.log(largest[:, 0])
         # Of a mode that has next to no mass, which the force sees by its square, it has nowhere to settle: it stays.
-        least = np.log(NEGLIGIBLE) / 2
-        stays = size < least
-        ends = np.where(stays, size, -np.inf), np.where(stays, size, np.inf)
-        sizes = ca.exp(ca.fmax(z.variable("size of participation", size, *ends), np.minimum(size, least)))
+        least = np.minimum(size, np.log(NEGLIGIBLE) / 2)
+        room = np.where(size > least, np.inf, 0.0)
+        sizes = ca.exp(ca.fmax(z.variable("size of participation", size, size - room, size + room), least))
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = ca.diag(sizes) @ z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))

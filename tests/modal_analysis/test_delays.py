@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.band.simulated_tests import draw
+from benchmarks.band.structures import structure as continuous
 from benchmarks.records.simulated import Records, Run, four_storeys
 from sysid.measurement.clocks import without_delays
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
@@ -186,3 +188,9 @@ def test_dampers_of_a_small_structure_are_no_delays(loss, seed):
     structure = sysid.Structure(np.diag([3.0, 2.0, 0.0]), K, n_base=1, damping_matrix=loss * np.eye(2))
     test = sysid.simulate(structure, np.linspace(1, 12, 150), noise=0.02, force=True, rng=seed)
     assert not Clock.of(test).delays
+
+
+def test_a_mode_close_above_the_lines_makes_no_channel_late():
+    """Complex residues of poles in the lines stand for it, real ones beside terms without poles do not."""
+    clean = draw(continuous(0), 2).measurement
+    assert not find_delays(clean, beside_poles(clean))

@@ -286,6 +286,25 @@ class TestFit:
             assert np.abs(gradient).max() < 1e-6 * np.abs(hessian).max() * np.sqrt(value)
 
 
+def test_the_participation_of_a_mode_that_noise_wants_to_weigh_less_than_nothing_stays_a_number(random_structure):
+    """The force sees its square, and nothing where it is small: its logarithm would fall for ever."""
+    smallest = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        structure = random_structure(rng, n=4, d=1)
+        test, truth = trial(rng, structure, force=True, noise=0.01, lines=150), modes_of(structure)
+        more = Modes(
+            truth.phi[:, :1], 0.05 * np.ones((1, 1)), np.sqrt(truth.omega[:1] * truth.omega[1:2]), np.array([0.01])
+        )
+        first = truth.joined(more)
+        end = solve_modes(
+            ModalEstimate.of_lines(test), first, relative_spectrum(first.omega, first.ratios), unit=np.ones(1),
+            remainder=structure.rigid_body_mass - truth.gamma.T @ truth.gamma, monitor=IterationMonitor(None, None),
+        )  # fmt: skip
+        smallest.append(np.abs(end.modes.gamma[-1, 0]))
+    assert min(smallest) == pytest.approx(1e-3, rel=1e-6)
+
+
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, seed, d):
