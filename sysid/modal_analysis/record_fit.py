@@ -30,7 +30,11 @@ from sysid.modal_analysis.noise_levels import (
     plain_levels,
     rough_levels,
 )
-from sysid.modal_analysis.record_model import NormalEquations, Parameters, RecordModel
+from sysid.modal_analysis.record_model import (
+    NormalEquations,
+    Parameters,
+    RecordModel,
+)
 from sysid.modal_analysis.residues import Records
 from sysid.structure.amplitude import LawForm
 from sysid.structure.structure import Array
@@ -294,9 +298,8 @@ def fit_model(
     monitor: FitMonitor,
     limits: Limits,
     coarse: RecordModel | None = None,
-    never: int = 5,
 ) -> RecordFit:
-    """Modes and levels in turn; a fit that takes all its steps in so many rounds one after the other never settles."""
+    """Modes and levels in turn."""
     test = model.test
     assert test.whole is not None
     least, plain = floors(model), test.whole.plain
@@ -308,7 +311,7 @@ def fit_model(
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = rough_levels(model, p)
-    settled, chi2, ended, equations = False, np.inf, 0, _Equations(model, coarse)
+    settled, chi2, equations = False, np.inf, _Equations(model, coarse)
     for round_ in range(limits.rounds):
         if round_ and model.whole.grows:  # held within a round: varying without log det it would bias the modes
             model = model.at_signal(p)
@@ -317,14 +320,11 @@ def fit_model(
         if stated is not None:
             settled = done
             break
-        ended = round_ + 1 if done else ended  # the rounds until the last that came to its end
         before = levels
         levels = plain_levels(model, p) if plain else likeliest_levels(model, p, levels)
         changes = [np.log(run.variances(levels) / run.variances(before)) for run in model.runs]
         if done and max(np.abs(one).max() for one in changes) < 2 * _SAME_LEVELS:
             settled = True
-            break
-        if round_ + 1 - ended >= never and limits.steps >= WHOLE.steps:
             break
     if stated is None:
         chi2 = model.at_signal(p).chi2(p, levels)  # at the last levels
