@@ -387,11 +387,14 @@ def _calibrated(
 ) -> tuple[RecordFit, Calibration]:  # fmt: skip
     """The fit once more without the errors of gains that it makes likely within tolerances.
 
-    And without modes that stood for them.
+    And without modes that stood for them, whose share of the errors is found once they are gone.
     """
     found = calibration_of(fit, stated)
     try:
-        return _pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor), found
+        calibrated = _pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor)
+        if calibrated.model.m < fit.model.m:
+            return _calibrated(on_turned(calibrated, fit.test, monitor=monitor), stated, monitor)
+        return calibrated, found
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True), stated
 

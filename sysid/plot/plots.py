@@ -407,11 +407,14 @@ def amplitude(identification: Identification) -> Figure:
     """
     structure, modal = identification.structure, identification.modal[0]
     refuse((not structure.laws, "amplitude: no mode of this result follows its amplitude"))
-    stretches = stretches_of(modal.given, modal.omega, modal.ratios)
+    try:
+        stretches = stretches_of(modal.given, 2 * np.pi * structure.natural_frequencies, structure.damping_ratios)
+    except (InputError, np.linalg.LinAlgError):  # records too short for stretches: the law stands alone
+        stretches = []
     figure = new_figure(9.0, 3.4 * len(structure.laws))
     for row, law in zip(figure.subplots(len(structure.laws), 2, squeeze=False), structure.laws, strict=True):
-        k = int(np.argmin(np.abs(np.log(modal.omega / (2 * np.pi * law.frequency)))))
-        draw_law(row, law, structure.mode_of(law) + 1, [(one, k) for one in stretches])
+        k = structure.mode_of(law)
+        draw_law(row, law, k + 1, [(one, k) for one in stretches])
     legend_below(row[0], row[0].get_legend_handles_labels()[0], 2)
     for ax in row:
         ax.set_xlabel("level of the mode [m/s²]")

@@ -48,7 +48,11 @@ class Verdict(NamedTuple):
 
 def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
-    end = replace(end, structure=end.structure.with_laws(prepared.laws))
+    try:
+        end = replace(end, structure=end.structure.with_laws(prepared.laws))
+    except InputError as error:
+        left_out = f"laws of amplitude are left out of the structure: {error}"
+        end = replace(end, findings=(*end.findings, Finding("amplitude open", Severity.CAUTION, left_out)))
     context = Context(prepared, end, session.cut_short)
     verdict = verdict_of(context)
     session.log(f"done: {verdict.message}")

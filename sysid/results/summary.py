@@ -191,7 +191,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
         if not it.structure.laws and any(one.numbers.get("trend") for one in it.of_kind("changing")):
             steps.append(
                 "or let the mode follow its amplitude, which whole records tell: sysid run test.h5 --amplitude "
-                "(Problem(..., amplitude=AmplitudeLaw(modes=[1])))"
+                "(Problem(..., amplitude=AmplitudeLaw()))"
             )
     # A goal is of accelerations: it takes no force for explained.
     if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:

@@ -35,7 +35,7 @@ from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom
 from sysid.search.local import LocalResult, solve
 from sysid.search.modal_program import End, Spectrum, Ties, fit_apart, solve_modes
 from sysid.search.session import Session
-from sysid.search.stated_masses import modal_masses_of, stated_totals, to_stated_totals
+from sysid.search.stated_masses import modal_masses_of, positive_part, stated_totals, to_stated_totals
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.superelement import ResidualModes
@@ -290,7 +290,7 @@ def modal_structure(
     if count is not None and count != modes.omega.size:
         raise DoesNotApplyError(too_few(modes.omega.size, count))
     chosen = degrees_of_freedom(problem, modes, options.sensors)
-    remainder = end.rigid - modes.gamma.T @ modes.gamma
+    remainder = positive_part(end.rigid - modes.gamma.T @ modes.gamma)
     if test.force is None:
         t = modal_masses_of(problem, modes, chosen)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])

@@ -51,7 +51,7 @@ class AmplitudeLaw:
     exponents: tuple[float, float] | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
-        if self.modes != "auto":
+        if not isinstance(self.modes, str) or self.modes != "auto":
             if not isinstance(self.modes, list | tuple) or not self.modes:
                 raise InputError(f"AmplitudeLaw: modes = {self.modes!r}; give 'auto', or numbers from 1: modes=[1]")
             modes = tuple(whole_number("AmplitudeLaw: a mode", mode, at_least=1) for mode in self.modes)

@@ -436,20 +436,20 @@ class Structure:
         Parameters
         ----------
         residual_vectors : bool
-            Keep the coordinates of residual modes; without them the form has the structure's own modes alone.
+            Keep the coordinates of residual modes; without them the form has the modes that are told, alone.
 
         References
         ----------
         R. R. Craig, M. C. C. Bampton, AIAA J. 6 (1968) 1313-1319.
         """
-        kept = slice(None) if residual_vectors else slice(self.n)
-        omega, loss, gamma = (part[kept] for part in self._modal_model)
+        alone = ModalModel(self._omega, self.modal_damping_matrix, self.participation)
+        omega, loss, gamma = self._modal_model if residual_vectors else alone
         base = np.zeros((self.n_base, self.n_base))
         return CraigBampton(
             mass=np.block([[np.eye(omega.size), gamma], [gamma.T, self.rigid_body_mass]]),
             stiffness=scipy.linalg.block_diag(np.diag(omega**2), base),
-            damping=scipy.linalg.block_diag(loss[:, kept], base),
-            recovery=np.hstack([self._all_shapes[:, kept], self.rigid_body]),
+            damping=scipy.linalg.block_diag(loss, base),
+            recovery=np.hstack([self._all_shapes if residual_vectors else self.mode_shapes, self.rigid_body]),
         )
 
     def _relative(self, freq: Array) -> ComplexArray:

@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, check_positive_definite, lowest_eigenvalue, refuse, shaped_array
-from sysid.structure.thresholds import EXACT, ROUND_OFF
+from sysid.structure.thresholds import EXACT
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
@@ -133,19 +133,24 @@ def in_band(omega: Array, loss: Array, coupling: Array, above: Array, loss_above
         By dampers with the static modes, rad/s.
     above, loss_above : (r,), (r, r)
         Static modes, rad/s.
+
+    Raises
+    ------
+    LinAlgError
+        Where not all modes keep a mass.
     """
-    found, T = np.zeros_like(omega), np.eye(omega.size)
-    for k, w in enumerate(omega):
-        for _ in range(100):
-            mass = np.eye(omega.size) - coupling.T / (above**2 - w**2) @ coupling
-            lam, V = scipy.linalg.eigh(np.diag(omega**2), mass)
-            last, w = w, np.sqrt(lam[k])
-            if abs(w - last) <= ROUND_OFF * w:
-                break
-        u = coupling @ V[:, k] / (above**2 - w**2)
-        # V has unit mass at w, S' that of the pole.
-        size = 1 - w**2 * np.sum(u**2)
-        found[k], T[:, k] = w, V[:, k] * np.sign(V[k, k]) / np.sqrt(size)
+    m, r = omega.size, above.size
+    # With q = c p / (W² - w²) beside p the problem is linear.
+    A = np.block([[np.diag(omega**2), np.zeros((m, r))], [-coupling, np.diag(above**2)]])
+    lam, x = scipy.linalg.eig(A, np.block([[np.eye(m), -coupling.T], [np.zeros((r, m)), np.eye(r)]]))
+    p, q = np.split(x.real, [m])
+    size = np.sum(p**2, axis=0) - np.sum((above[:, None] * q) ** 2, axis=0)
+    kept = np.flatnonzero((lam.imag == 0) & (lam.real > 0) & (size > 0))
+    if kept.size != m:
+        raise np.linalg.LinAlgError("dampers couple modes and static ones as strongly as their masses do")
+    kept = kept[np.argsort(lam[kept].real)]
+    found, T = np.sqrt(lam[kept].real), p[:, kept] / np.sqrt(size[kept])
+    T = T * np.where(np.diag(T) < 0, -1.0, 1.0)
     moved = coupling @ T / (above[:, None] ** 2 - found**2) * found
     return found, T, T.T @ loss @ T - moved.T @ loss_above @ moved
 

@@ -277,3 +277,13 @@ def test_spectra_have_no_amplitude():
     test = sysid.simulate(one, np.linspace(1, 10, 50))
     with pytest.raises(sysid.InputError, match="whole records"):
         sysid.Problem(test, amplitude=sysid.AmplitudeLaw())
+
+
+def test_a_law_of_a_mode_that_the_answer_has_not_is_told_and_left_out():
+    """One mode is asked for, and the law is of the other."""
+    law = AmplitudeLaw(modes=[2], exponents=(1.0, 1.0))
+    test = test_of((0.3, 3.0), both=True)
+    result = sysid.identify(sysid.Problem(test, amplitude=law), strategy=sysid.Modal(modes=1), rng=0)
+    assert result.structure.n == 1
+    assert not result.structure.laws
+    assert [one.severity for one in result.findings if one.kind == "amplitude open"] == ["caution"]

@@ -91,6 +91,8 @@ def test_the_craig_bampton_form_holds_them_unless_they_are_left_out(pair, kept):
     form, d = s.to_craig_bampton(residual_vectors=kept), s.n_base
     n = len(form.mass) - d
     assert n == (6 if kept else 4)
+    own = (2 * np.pi * s.natural_frequencies) ** 2
+    assert kept or np.diag(form.stiffness)[:n] == pytest.approx(own, rel=1e-12)
     assert not kept or np.linalg.eigvalsh(form.mass)[0] > -1e-9 * np.abs(form.mass).max()
     w = 2 * np.pi * 30.0
     Z = -(w**2) * form.mass + 1j * w * form.damping + form.stiffness
