@@ -19,6 +19,7 @@ from benchmarks.laboratory.kinds import KINDS, Case
 from benchmarks.laboratory.rigs import Rig
 from benchmarks.mistakes.named_mistakes import MISTAKES
 from benchmarks.records.coupled_records import NEAR, matched
+from benchmarks.records.simulated import Modes
 
 TOLERANCE = "0.005"  # what --gain-std states
 
@@ -34,7 +35,7 @@ def figures(kind: str, draw: int) -> dict[str, Any]:
         (folder / "list.toml").write_text(case.sensors, encoding="utf-8")
         files = [str(path) for path in case.files]
         read, _ = command("read", *files, "--sensors", str(folder / "list.toml"), "--out", str(folder / "test.h5"))
-        true = case.rig.frequencies[: case.rig.count].tolist()
+        true = (case.rig.shown.omega[: case.rig.count] / (2 * np.pi)).tolist()
         told = {"kind": kind, "draw": draw, "what": case.rig.name, "end": case.rig.end, "true": true}
         if read.returncode:
             return told | {"refused": last_line(read)}
@@ -64,11 +65,12 @@ def _beside(result: sysid.Identification, case: Case) -> dict[str, Any]:
     """An answer beside the truth: errors over deviations, by what they are of."""
     rig, found, known = case.rig, result.structure, result.uncertainty
     low, high = result.measurement.freq[[0, -1]]
-    f, true = found.natural_frequencies, rig.frequencies
+    modes = rig.shown
+    f, true = found.natural_frequencies, modes.omega / (2 * np.pi)
     mine = np.flatnonzero((f >= low) & (f <= high))
     maybe = np.flatnonzero((true >= low) & (true <= high))  # of which those at the end, or beyond the motion, may lack
-    must = maybe[(maybe < rig.count) & (true[maybe] * (1 + rig.modes.zeta[maybe]) <= high)]
-    near = np.maximum(NEAR[1] * rig.modes.zeta[maybe] * true[maybe], NEAR[0] * np.nanmax(known.natural_frequencies))
+    must = maybe[(maybe < rig.count) & (true[maybe] * (1 + modes.zeta[maybe]) <= high)]
+    near = np.maximum(NEAR[1] * modes.zeta[maybe] * true[maybe], NEAR[0] * np.nanmax(known.natural_frequencies))
     pairs = np.array(matched(true[maybe], f[mine], near), dtype=int).reshape(-1, 2)
     at, mine = maybe[pairs[:, 0]], mine[pairs[:, 1]]
     counted = bool(np.isin(must, at).all() and np.isin(np.flatnonzero((f >= low) & (f <= high)), mine).all())
@@ -82,11 +84,11 @@ def _beside(result: sysid.Identification, case: Case) -> dict[str, Any]:
     }  # fmt: skip
     off = told["off"]
     off["f"] = _over(f[mine] - true[at], known.natural_frequencies[mine])
-    off["zeta"] = _over(found.damping_ratios[mine] - rig.modes.zeta[at], known.damping_ratios[mine])
+    off["zeta"] = _over(found.damping_ratios[mine] - modes.zeta[at], known.damping_ratios[mine])
     if counted and case.drifts:
         off["drift"] = _drifts(result, rig, at)
     if counted and result.determined and found.n == at.size and np.all(found.dof_sensors >= 0):
-        off |= _matrices(result, rig, at)
+        off |= _matrices(result, modes, at)
     return told
 
 
@@ -101,11 +103,11 @@ def _over(error: np.ndarray, std: np.ndarray) -> list[float]:
     return [float(one) for one in np.ravel(error / std)]
 
 
-def _matrices(result: sysid.Identification, rig: Rig, true: np.ndarray) -> dict[str, list[float]]:
+def _matrices(result: sysid.Identification, modes: Modes, true: np.ndarray) -> dict[str, list[float]]:
     """Errors of M_SS and K_SS against those of the true modes at the same sensors, each entry once."""
-    inverse = np.linalg.inv(rig.modes.shapes[np.ix_(result.structure.dof_sensors, true)])
+    inverse = np.linalg.inv(modes.shapes[np.ix_(result.structure.dof_sensors, true)])
     off = {}
-    for name, what, size in (("M", "mass", 1.0), ("K", "stiffness", rig.modes.omega[true, None] ** 2)):
+    for name, what, size in (("M", "mass", 1.0), ("K", "stiffness", modes.omega[true, None] ** 2)):
         std = getattr(result.uncertainty, what)
         error = getattr(result.structure, what)[: true.size, : true.size] - inverse.T @ (size * inverse)
         entries = np.tril(std > 0)  # those that a stated form leaves zero have none

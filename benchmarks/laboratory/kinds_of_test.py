@@ -1,7 +1,8 @@
 """Kinds of test that laboratories run, as their files, by ``sysid read`` and ``sysid run`` alone, beside the truth.
 
 Finite-element structures that move in closed form; the channels of each test have gains, noise, hum, drift, a clock and
-16 bits of their own (`spoiling`). What is in the lines is what the base excites; modes above are residual ones.
+16 bits of their own (`spoiling`). What is in the lines is what the base excites; modes above are residual ones. Of a
+structure with a dashpot the modes are those that the lines show, with the answer of those above (`Rig.shown`).
 
 ``python -m benchmarks.laboratory.kinds_of_test NUMBER SECONDS`` prints the figures of draw NUMBER % 100 of kind
 NUMBER // 100.

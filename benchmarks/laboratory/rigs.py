@@ -59,6 +59,36 @@ class Rig:
         return self.modes.omega / (2 * np.pi)
 
     @property
+    def shown(self) -> Modes:
+        """Modes as the lines show them: those in them with the answer of those above, where dampers couple both.
+
+        The dynamic stiffness of those within is D(w) = W² - w² + i w Z + H(w), see `_held`: a mode p has
+        Re D(w_k) p = 0, the mass 1 = -p' Re dD/d(w²) p and the loss p' Im D(w_k) p / w_k. A dashpot c between points
+        that the modes above let move by F a unit of force damps by c / (1 + (w c F)²): where w c F is large it holds
+        them together and damps nothing, however large p' C p is of modes that do without it.
+        """
+        modes, own, turn = self.modes, slice(0, self.count), np.eye(self.modes.omega.size)
+        if not self.loss[own, self.count :].any():
+            return modes
+        omega, zeta = modes.omega.copy(), modes.zeta.copy()
+        for k, w in enumerate(modes.omega[own]):
+            last = 0.0
+            while abs(w - last) > 1e-12 * w:
+                squares, V = np.linalg.eigh(np.diag(modes.omega[own] ** 2) + self._held(w).real)
+                last, w = w, np.sqrt(squares[k])
+            p, step = V[:, k], 1e-5 * w
+            slope = (self._held(w + step) - self._held(w - step)).real / (4 * w * step)  # along w²
+            mass, loss = 1 - p @ slope @ p, p @ (self.loss[own, own] + self._held(w).imag / w) @ p
+            omega[k], zeta[k], turn[own, k] = w, loss / mass / (2 * w), p * np.sign(p[k]) / np.sqrt(mass)
+        return replace(modes, omega=omega, zeta=zeta, shapes=modes.shapes @ turn, gamma=turn.T @ modes.gamma)
+
+    def _held(self, w: float) -> np.ndarray:
+        """H(w) = w² Z_ba (W_a² - w² + i w Z_aa)^-1 Z_ab, by which modes above hold those within, (count, count)."""
+        above, across = slice(self.count, None), self.loss[self.count :, : self.count]
+        X = np.diag(self.modes.omega[above] ** 2 - w**2) + 1j * w * self.loss[above, above]
+        return np.asarray(w**2 * across.T @ np.linalg.solve(X, across))
+
+    @property
     def end(self) -> float:
         """Frequency up to which the base moves, Hz: between the last mode in the lines and the next."""
         last, following = self.frequencies[self.count - 1 : self.count + 1]
