@@ -8,10 +8,11 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.modal_fit import modes_within
+from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
 from sysid.modal_analysis.record_fit import (
     ROUGH,
@@ -46,7 +47,7 @@ def with_laws(
     Raises
     ------
     InputError
-        Where there is no such mode, or two of them are one.
+        Where there is no such mode.
     """
     stages: list[tuple[RecordFit, RecordFit]] = []
     rest: list[FittedLaw] = []
@@ -81,9 +82,9 @@ def _stages(
     if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
         best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
-    for mode in modes:
+    for omega in linear.parameters.modes.omega[modes]:
         found = best
-        for found in _with_law_of(best, mode, stated.exponents, tries, limits, monitor):
+        for found in _with_law_of(best, omega, stated.exponents, tries, limits, monitor):
             if not best.parameters.laws:  # further laws are judged alone, at their end
                 yield found, linear
             found = _judged(found, best if best.parameters.laws else linear, since=len(best.parameters.laws))
@@ -110,15 +111,20 @@ def _stages(
 
 
 def _with_law_of(
-    best: RecordFit, mode: int, exponents: tuple[float, float] | Literal["auto"], tries: tuple[float, ...],
+    best: RecordFit, omega: float, exponents: tuple[float, float] | Literal["auto"], tries: tuple[float, ...],
     limits: Limits, monitor: FitMonitor,
 ) -> Iterator[RecordFit]:  # fmt: skip
-    """The fit with a law of one more mode, likelier from one to the next."""
-    which = f"a law of amplitude near {best.parameters.modes.omega[mode] / (2 * np.pi):.3g} Hz"
+    """The fit with a law of one more mode, of this frequency, likelier from one to the next."""
+    which = f"a law of amplitude near {omega / (2 * np.pi):.3g} Hz"
     monitor.doing = which
     before = best.parameters.laws[-1].form[:2] if best.parameters.laws else (OF_FREQUENCY[0], OF_DAMPING[0])
     first = before if exponents == "auto" else exponents
-    best = _started(best, mode, first, tries, limits, monitor)
+    started: list[RecordFit] = []
+    for begun in _beginnings(best, omega, monitor):
+        started.append(_started(*begun, first, tries, limits, monitor))
+        if started[-1].schwarz > best.schwarz:
+            break
+    best = max(started, key=lambda one: one.schwarz)
     yield best
     kinds: tuple[Literal["of_frequency", "of_damping"], ...] = ("of_frequency", "of_damping")
     for kind, each in zip(kinds, (OF_FREQUENCY, OF_DAMPING), strict=True) if exponents == "auto" else ():
@@ -159,36 +165,56 @@ def _of_lines(fit: RecordFit) -> Array:
 
 
 def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
-    """Numbers of the modes that are to have a law among those of a fit."""
-    p = fit.parameters
-    omega, ratios = p.modes.omega, p.modes.ratios
-    inside = np.flatnonzero(modes_within(omega, 2 * np.pi * fit.test.freq[[0, -1]], np.zeros(0)))
-    order = inside[np.argsort(omega[inside], kind="stable")].tolist()
-    numbers = range(1, len(order) + 1) if stated.modes == "auto" else stated.modes
-    if max(numbers, default=1) > len(order):
+    """Numbers of the modes that are to have a law among those of a fit; of several that are one mode, the first."""
+    modes, found = fit.parameters.modes, list[int]()
+    inside = modes_within(modes.omega, 2 * np.pi * fit.test.freq[[0, -1]], np.zeros(0))
+    for k in np.argsort(modes.omega, kind="stable").tolist():
+        if inside[k] and not np.any(_like(modes, k)[found]):
+            found.append(k)
+    numbers = range(1, len(found) + 1) if stated.modes == "auto" else stated.modes
+    if max(numbers, default=1) > len(found):
         raise InputError(
             f"AmplitudeLaw: mode {max(numbers, default=1)} is to follow its amplitude, and the records show "
-            f"{len(order)} modes within their lines: state the number of one of these"
+            f"{len(found)} modes within their lines: state the number of one of these"
         )
-    found: list[int] = []
-    for number in numbers:
-        k = order[number - 1]
-        # A frame that changes shows twice near one frequency, of one shape: with a law one of the two is nothing.
-        one = [other for other in found if _are_one(omega[[k, other]], ratios[[k, other]], p.modes.phi[:, [k, other]])]
-        if one and stated.modes != "auto":
-            raise InputError(
-                f"AmplitudeLaw: mode {number}, {omega[k] / (2 * np.pi):.4g} Hz, and mode {order.index(one[0]) + 1}, "
-                f"{omega[one[0]] / (2 * np.pi):.4g} Hz, are one mode that changes, by frequency and shape: state one"
-            )
-        found += [] if one else [k]
-    return found
+    return [found[number - 1] for number in numbers]
 
 
-def _are_one(omega: Array, ratios: Array, shapes: Array, alike: float = 0.9) -> bool:
-    """True of two modes of one shape, nearer than their half-power widths together; `alike` is the assurance of it."""
-    a, b = shapes.T
-    near = abs(omega[1] - omega[0]) < 2 * float(ratios @ omega)
-    return bool(near and len(a) > 1 and (a @ b) ** 2 > alike * (a @ a) * (b @ b))
+def _like(modes: Modes, k: int, assurance: float = 0.9, reach: float = 0.2) -> NDArray[np.bool_]:
+    """True of modes that may be mode k at other levels, (m,), itself too: of its shape, within what a law may move.
+
+    A linear fit shows a mode that changes once for each level, or twice near one frequency.
+    """
+    near = np.abs(np.log(modes.omega / modes.omega[k])) < reach
+    if len(modes.phi) == 1:  # all are of one shape
+        return np.arange(near.size) == k
+    size = np.sum(modes.phi**2, axis=0)
+    return near & ((modes.phi.T @ modes.phi[:, k]) ** 2 >= assurance * size * size[k])
+
+
+def _beginnings(fit: RecordFit, omega: float, monitor: FitMonitor) -> list[tuple[RecordFit, int]]:
+    """Fits to which a law of the mode nearest to a frequency is added, and its number there.
+
+    Where it shows at several levels, first with all these as one mode: from their mean pole and the sum of their
+    residues, as they may be large and cancel one another.
+    """
+    p, numbers = fit.parameters, np.arange(fit.model.m)
+    free = ~np.isin(numbers, [law.mode for law in p.laws])
+    k = int(np.argmin(np.where(free, np.abs(p.modes.omega - omega), np.inf)))
+    like = free & _like(p.modes, k)
+    if np.count_nonzero(like) == 1:
+        return [(fit, k)]
+    same = p.modes.at(like)
+    u, s, vt = np.linalg.svd(same.phi @ same.gamma)
+    # A force weighs the mode: it answers by the squares of participations.
+    size = float(np.linalg.norm(same.gamma @ vt[0])) if fit.model.force else float(np.sqrt(s[0]))
+    kept = p.at(~like | (numbers == k))
+    number = int(np.count_nonzero(~like[:k]))
+    modes = Modes(*(part.copy() for part in kept.modes))
+    modes.phi[:, number], modes.gamma[number] = u[:, 0] * s[0] / max(size, ROUND_OFF), vt[0] * size
+    modes.omega[number], modes.ratios[number] = (np.exp(np.mean(np.log(part))) for part in same[2:])
+    once = refitted(fit, replace(kept, modes=modes), limits=ROUGH, monitor=monitor)
+    return [(once, number), (fit, k)]
 
 
 def _started(

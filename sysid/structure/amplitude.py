@@ -22,9 +22,8 @@ from sysid.structure.thresholds import beyond_chance
 
 Array = NDArray[np.floating[Any]]
 
-SLOWEST, MOST_DAMPED = 0.2, 0.9  # of w0; a damping ratio: no law leads beyond, so that any step of a fit can be tried
-
-
+# Of w0, as it is over the fastest; a damping ratio: no law leads beyond, so that any step of a fit can be tried.
+SLOWEST, MOST_DAMPED = 0.2, 0.9
 OF_FREQUENCY, OF_DAMPING = (0.5, 1.0, 2.0), (0.5, 1.0, 2.0, -1.0)
 
 
@@ -102,7 +101,8 @@ class LawForm(NamedTuple):
         unit = A / self.level
         w = omega * (1 - values[0] * _power(unit, self.of_frequency))
         zeta = ratio + values[1] * _power(unit, self.of_damping)
-        return ca.fmax(w, SLOWEST * omega), ca.fmin(ca.fmax(zeta, 0.0), MOST_DAMPED)
+        w = ca.fmin(ca.fmax(w, SLOWEST * omega), omega / SLOWEST)
+        return w, ca.fmin(ca.fmax(zeta, 0.0), MOST_DAMPED)
 
 
 def _power(unit: ca.SX, exponent: float) -> ca.SX:

@@ -10,8 +10,8 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.modal_analysis.amplitude_fit import _envelopes, _modes_of, _with_exponent
-from sysid.modal_analysis.fit import fit_modes, follow_amplitude
+from sysid.modal_analysis.amplitude_fit import _envelopes, _modes_of, _with_exponent, fitted_laws, with_laws
+from sysid.modal_analysis.fit import fit_modes, follow_amplitude, left_of
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import record_modes
@@ -150,15 +150,39 @@ def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
     assert again.problem.amplitude == sysid.AmplitudeLaw()
 
 
-def test_a_mode_that_shows_twice_has_one_law(test):
-    fit = record_modes(test, np.append(OMEGA, 1.01 * OMEGA[0]), np.append(RATIOS, RATIOS[0]))
-    omega, ratios, phi = np.append(OMEGA, 1.01 * OMEGA[0]), np.append(RATIOS, RATIOS[0]), PHI[:, [0, 1, 0]]
-    modes = fit.parameters.modes._replace(omega=omega, ratios=ratios, phi=phi)
+def test_modes_that_are_one_count_once(test):
+    fit = record_modes(test, np.append(OMEGA, 0.94 * OMEGA[0]), np.append(RATIOS, RATIOS[0]))
+    modes = fit.parameters.modes._replace(omega=np.append(OMEGA, 0.94 * OMEGA[0]), phi=PHI[:, [0, 1, 0]])
     fit = replace(fit, parameters=replace(fit.parameters, modes=modes))
-    with pytest.raises(sysid.InputError, match="one mode that changes"):
-        _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 2]))
-    assert _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 3])) == [0, 1]
-    assert _modes_of(fit, sysid.AmplitudeLaw()) == [0, 1]
+    assert _modes_of(fit, sysid.AmplitudeLaw(modes=[2, 1])) == [1, 2]
+    assert _modes_of(fit, sysid.AmplitudeLaw()) == [2, 1]
+    with pytest.raises(sysid.InputError, match="mode 3 .* 2 modes"):
+        _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 3]))
+
+
+def test_a_mode_that_shows_at_several_levels_has_one_law(test):
+    """As the linear fit of a long test of levels 1:10 has three poles of one mode."""
+    fit = record_modes(test, OMEGA[[0, 0, 0, 1]] * [0.93, 0.96, 1.0, 1.0], RATIOS[[0, 0, 0, 1]])
+    assert fit.model.m == 4
+    found, _ = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    (law,) = fitted_laws(found)
+    assert found.model.m == 2  # and so two sensors have as many modes as there are
+    scale = LEVEL / law.form.level
+    truth = np.concatenate([np.log([3.0, 0.012]), [FALL * scale**-0.5, RISE / scale]])
+    away = np.concatenate([np.log([law.frequency, law.ratio]), law.values]) - truth
+    assert law.is_certain
+    assert np.all(np.abs(away) < 5 * np.sqrt(np.diag(law.covariance)))
+
+
+def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
+    """One mode has a law; the other, linear and a tenth above, moves the sensors alike, as a tuned mass makes it."""
+    w, beside = 2 * np.pi * test.freq, 2 * np.pi * 3.3
+    added = 0.3 * w**2 / (beside**2 - w**2 + 0.04j * beside * w) * test.base
+    both = replace(test, response=test.response + PHI[:, :1] * added)
+    fit = record_modes(both, np.append(OMEGA, beside), np.append(RATIOS, 0.02))
+    found, _ = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    assert np.sort(found.parameters.modes.omega) / (2 * np.pi) == pytest.approx([3.0, 3.3, 8.0], rel=1e-3)
+    assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0], rel=1e-3)
 
 
 def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(test, answer):
@@ -281,7 +305,7 @@ def test_spectra_have_no_amplitude():
 
 def test_a_law_of_a_mode_that_the_answer_has_not_is_told_and_left_out():
     """One mode is asked for, and the law is of the other."""
-    law = AmplitudeLaw(modes=[2], exponents=(1.0, 1.0))
+    law = sysid.AmplitudeLaw(modes=[2], exponents=(1.0, 1.0))
     test = test_of((0.3, 3.0), both=True)
     result = sysid.identify(sysid.Problem(test, amplitude=law), strategy=sysid.Modal(modes=1), rng=0)
     assert result.structure.n == 1

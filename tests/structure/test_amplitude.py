@@ -76,6 +76,13 @@ def test_derivatives_are_those_of_differences(form):
         assert np.abs(exact[1 + k] - difference).max() < 1e-5 * np.abs(difference).max()
 
 
+def test_a_mode_that_hardens_without_bound_moves_on_in_finite_numbers():
+    """As a fit may try: each level raises the frequency, which raises the level."""
+    u = np.stack([load(300), np.roll(load(300), 7)])
+    rows = motion(LawForm(2.0, 1.0, 1.0), np.array([1.1, 0.4]) @ u, 1 / RATE, numbers(-0.5, -0.01), np.zeros(2), u)
+    assert np.all(np.isfinite(rows))
+
+
 def law(fall=0.03, rise=0.01):
     return FittedLaw(
         4.0, 0.012, 0, LawForm(0.5, 1.0, 20.0), np.array([fall, rise]), (0.1, 20.0), 1e-8 * np.eye(4), 99.0
