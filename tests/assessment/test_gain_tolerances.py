@@ -14,7 +14,9 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.fit import fit_modes, whole_fit
-from sysid.modal_analysis.record_fit import refitted
+from sysid.modal_analysis.model_order import Peak
+from sysid.modal_analysis.model_order import _with as with_peak
+from sysid.modal_analysis.record_fit import on_turned
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import calibration_of
 
@@ -244,12 +246,15 @@ def test_a_mode_that_stood_for_errors_of_gains_goes_with_them(records, monkeypat
     """What was worth a mode before, as a second one within the width of another, is none beside the gains."""
     read = dataclasses.replace(misread(records, np.r_[0.005 * np.array([1, -1, 1, 2]), 0.0, 0.0]), **TOLERANCES)
     fit = whole_fit(read)
-    modes = fit.parameters.modes
-    slow = modes.at([0])._replace(omega=0.8 * modes.omega[:1], ratios=np.array([0.9]), phi=1e-3 * modes.phi[:, :1])
-    monkeypatch.setattr(
-        "sysid.modal_analysis.fit.whole_fit",
-        lambda *_, **__: refitted(fit, dataclasses.replace(fit.parameters, modes=slow.joined(modes))),
+    modes, inputs = fit.parameters.modes, fit.model.d + 2 * len(fit.model.moving)
+    slow = Peak(
+        0.8 * modes.omega[0],
+        0.9,
+        1e-3 * np.r_[modes.phi[:, 0], modes.gamma[0]],
+        np.r_[modes.gamma[0], np.zeros(inputs - 1)],
     )
+    more = dataclasses.replace(fit, parameters=with_peak(fit, fit.parameters, slow))
+    monkeypatch.setattr("sysid.modal_analysis.fit.whole_fit", lambda *_, **__: on_turned(more, fit.test))
     found = fit_modes(read)
     assert np.any(found.calibration.values)
     assert np.allclose(found.modes.omega, modes.omega, rtol=1e-4)
