@@ -43,12 +43,12 @@ def lines(reduced: bool) -> Iterator[Line]:
             if left[0] <= 0:
                 raise end("stopped")
 
-        found = with_laws(linear, asked, left_of, monitor=FitMonitor(stop))
+        found, _ = with_laws(linear, asked, left_of, monitor=FitMonitor(stop))
         laws = found.parameters.laws
         faults = {
             "not told": not found.stopped,
             "a law that is not likelier": any(not law.likelier for law in laws),
-            "worse than the linear fit": not laws and abs(found.likelihood / linear.likelihood - 1) > ROUND_OFF,
+            "neither a law nor the linear fit": not laws and abs(found.likelihood / linear.likelihood - 1) > ROUND_OFF,
         }
         wrong |= {fault for fault, there in faults.items() if there}
         good += not any(faults.values())
