@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import math
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")
 _BLANKS = re.compile(r"[ \t]+")
 _DIGITS = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _COMPLEX = re.compile(rf"\(?\s*({_DIGITS})\s*([+-])\s*\+?({_DIGITS})\s*\*?\s*[ij]\s*\)?")
-_CLOCK = re.compile(r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]\s*)?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d*)?)Z?")
+_DATE = r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}"
+_CLOCK = re.compile(rf"(?:{_DATE}[ T]\s*)?(?:(\d{{1,2}}):)?(\d{{1,2}}):(\d{{2}}(?:\.\d*)?)\s*([AaPp][Mm]|Z)?")
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,19 @@ class Form:
 
 
 def _number(field: str) -> complex | None:
-    """A number, complex such as 1.5-2j too; the seconds of a time of day such as 12:30:01.005, behind a date or not."""
+    """A number, complex such as 1.5-2j too; the seconds of a time of day such as 12:30:01.005; NaN for a date alone.
+
+    A date may stand before the time, AM or PM behind it, and its hours may be left out.
+    """
     try:
         return float(field)
     except ValueError:
         if match := _CLOCK.fullmatch(field):
-            return 3600.0 * int(match[1]) + 60.0 * int(match[2]) + float(match[3])
+            hours, half = int(match[1] or 0), (match[4] or "").upper()
+            hours = hours % 12 + 12 * (half == "PM") if half in ("AM", "PM") else hours
+            return 3600.0 * hours + 60.0 * int(match[2]) + float(match[3])
+        if re.fullmatch(_DATE, field):
+            return math.nan
         if match := _COMPLEX.fullmatch(field):
             return complex(float(match[1]), float(match[3]) * (-1 if match[2] == "-" else 1))
     return None

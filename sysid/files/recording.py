@@ -16,7 +16,10 @@ from sysid.files import units
 from sysid.files.description import Description
 from sysid.structure.structure import Array
 
-_TIMES = ("time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time", "x_value")
+_TIMES = (
+    "time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time", "x_value", "date/time",
+    "date time", "datetime",
+)  # fmt: skip
 _FREQUENCIES = (
     "freq", "frequency", "frequencies", "freq_hz", "f_hz", "frequenz", "fréquence", "frequence", "frecuencia",
     "frequenza",
@@ -127,9 +130,11 @@ def check_column(column: Column, path: Path) -> None:
 def rate_of(time: Array, path: Path, place: str) -> float:
     """Sample rate of a time column in s, Hz; numbers rounded to a quarter of a step are even.
 
-    Refused is time that does not rise, or whose steps are uneven, with its sample.
+    A time of day may pass midnight. Refused is time that does not rise, or whose steps are uneven, with its sample.
     """
     refuse((time.size < 3, f"{path}: {time.size} samples are no record: is it the right file, and whole?"))
+    day = 86400.0
+    time = time + day * np.cumsum(np.diff(time, prepend=time[0]) < -0.99 * day)
     falls = np.flatnonzero(np.diff(time) <= 0)
     if falls.size:
         before, after = time[falls[0]], time[falls[0] + 1]

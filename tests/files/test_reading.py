@@ -1,5 +1,6 @@
 """A laboratory's files are read right, or told in one line that names file, place and remedy."""
 
+import datetime
 import re
 from itertools import chain
 
@@ -66,6 +67,24 @@ def test_the_rate_of_a_short_record_is_that_of_its_times(tmp_path, rate):
     rows = [f"{i / rate:.12g};{i % 7};{i % 5};{i % 3}" for i in range(100)]
     (tmp_path / "run.csv").write_text("\n".join(["time;table;top;force", "s;g;mm/s²;kN", *rows]), encoding="utf-8")
     assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "head, form",
+    [
+        ("Date;Time", lambda at: f"{at:%d.%m.%Y};{at:%H:%M:%S,%f}"),
+        ("Date/Time", lambda at: f"{at:%m/%d/%Y %I:%M:%S.%f %p}"),
+        ("Elapsed time", lambda at: f"{at:%M:%S.%f}"),
+    ],
+)
+@pytest.mark.parametrize("begins", ["11:59:59", "23:59:59"])
+def test_times_of_day_have_dates_beside_them_halves_of_a_day_and_pass_midnight(tmp_path, head, form, begins):
+    """Two seconds at 200 Hz; minutes alone begin at zero."""
+    begin = datetime.datetime.fromisoformat(f"2026-03-01T{'00:00:00' if head[0] == 'E' else begins}")
+    rows = [f"{form(begin + datetime.timedelta(seconds=i / 200))};{i % 7};{i % 5};{i % 3}" for i in range(400)]
+    units = f"{';' * head.count(';')};g;mm/s²;kN"
+    (tmp_path / "run.csv").write_text("\n".join([f"{head};table;top;force", units, *rows]), encoding="utf-8")
+    assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(200, rel=1e-9)
 
 
 def test_units_in_brackets_and_a_cut_last_row(tmp_path):
