@@ -17,6 +17,7 @@ from sysid.files.recording import Column, Recording, is_abscissa
 from sysid.files.tree import Allowance, check_all_links, check_data
 
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "srate")
+_STEPS = ("dt", "delta_t", "increment")  # s
 
 
 def read_npz(path: Path) -> list[Recording]:
@@ -144,11 +145,14 @@ def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording
     refuse((square is not None, f"{path}: array {square!r} {words}"))
     other = [name for name, (one, _) in vectors.items() if one.size != length]
     remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
-    rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)
+    rates = [value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES]
+    if not any(np.iscomplexobj(one) for one, _ in vectors.values()):  # functions have steps of frequency
+        steps = (value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _STEPS)
+        rates += [1 / value for value in steps if value > 0]
     columns = tuple(
         Column(name, one, unit, f"array {name!r}") for name, (one, unit) in vectors.items() if name not in other
     )
-    return [Recording(path, columns, rate, remarks=tuple(remarks))]
+    return [Recording(path, columns, next(iter(rates), None), remarks=tuple(remarks))]
 
 
 def _lines(array: Any, lengths: set[int]) -> Any:

@@ -13,7 +13,7 @@ from laboratory import FREQ, F, H
 
 import sysid
 from sysid.cli import main as cli
-from sysid.files import reading, recorded_test
+from sysid.files import arrays, reading, recorded_test
 
 G = 9.80665
 SENSORS = {
@@ -131,6 +131,16 @@ def test_a_thousand_channels_are_read(tmp_path):
     sensors = [{"column": f"A{i}", "role": role, "axis": "x"} for i, role in enumerate(roles)]
     test = reading.gather(tmp_path / "run.csv", {"sample_rate": 100, "sensor": sensors})
     np.testing.assert_allclose(test.runs[0][1], G * values.T[1:], rtol=1e-12)
+
+
+@pytest.mark.parametrize("given, rate", [({"Fs": 250.0}, 250.0), ({"x_values": {"increment": 0.004}}, 250.0)])
+def test_the_rate_of_arrays_is_that_of_their_file(tmp_path, given, rate):
+    values = {name: np.random.default_rng(1).standard_normal(400) for name in ("table", "top", "force")}
+    scipy.io.savemat(tmp_path / "run.mat", values | given)
+    with_units = {"sensor": [{**one, "unit": "N" if one["role"] == "force" else "g"} for one in SENSORS["sensor"]]}
+    assert reading.gather(tmp_path / "run.mat", with_units).sample_rate == pytest.approx(rate, rel=1e-12)
+    scipy.io.savemat(tmp_path / "frf.mat", {name: one + 1j for name, one in values.items()} | {"increment": 0.5})
+    assert arrays.read_mat(tmp_path / "frf.mat")[0].sample_rate is None
 
 
 @pytest.mark.parametrize("ending", ["mat", "npz", "h5"])
