@@ -64,7 +64,7 @@ def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str,
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
     relative = test.relative, test.predict(structure), test.response_std
-    responses = _record(problem.modal[0], *relative, _CLEAR)
+    responses = _record(*relative, _CLEAR)
     seen = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
     open_ = list(map(left_open, seen))
     if free:
@@ -308,37 +308,23 @@ def _like_rigid(test: Measurement, structure: Structure, k: int) -> str:
     )
 
 
-def _record(
-    modal: ModalEstimate, record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float
-) -> _Record:
-    """Weigh a record; `times` the misfit is what may look like a mode where its origin is unknown.
+def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float) -> _Record:
+    """Weigh a record; `times` the misfit is what may look like a mode where no noise is known.
 
-    Where the misfit is no more than the stated noise, all lines together tell an amplitude, and `_RESOLVED` of
-    its standard deviations will do.
+    Where it is, an amplitude counts by the noise at its own lines, and `_RESOLVED` of its standard deviations will do;
+    where the misfit is larger than that noise, so is what may look like a mode.
     """
-    if modal.by_modes and std is not None:
-        return _record_a_line(record, predicted, std)
+    if std is not None:
+        weight = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
+        size, left = (float(np.linalg.norm(part * weight)) for part in (record, record - predicted))
+        more = max(1.0, left / np.sqrt(np.count_nonzero(weight)) / _AS_STATED)
+        return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
-    noise = rms(record - predicted) if std is None else rms(std)
-    sizes = rms(record)
+    noise, sizes = rms(record - predicted), rms(record)
     weight = 1 / np.maximum(noise, ROUND_OFF * np.where(sizes > 0, sizes, sizes.max()))
     size = float(np.linalg.norm(record * weight))
     misfit = float(np.linalg.norm((record - predicted) * weight)) / size
-    level = times * misfit
-    if std is not None and misfit <= _AS_STATED * np.linalg.norm(std * weight) / size:
-        level = float(_RESOLVED * misfit / np.sqrt(2 * record.size))
-    return _Record(weight, size, misfit, level)
-
-
-def _record_a_line(record: ComplexArray, predicted: ComplexArray, std: Array) -> _Record:
-    """Weigh a record whose noise is known at each line: an amplitude counts by the noise at its own lines.
-
-    Where the misfit is larger than that noise, so is what may look like a mode.
-    """
-    weight = 1 / std
-    size, left = (float(np.linalg.norm(part * weight)) for part in (record, record - predicted))
-    more = max(1.0, left / np.sqrt(record.size) / _AS_STATED)
-    return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
+    return _Record(weight, size, misfit, times * misfit)
 
 
 def _forces(modal: ModalEstimate, structure: Structure) -> _Record | None:
@@ -346,7 +332,7 @@ def _forces(modal: ModalEstimate, structure: Structure) -> _Record | None:
     test = modal.records
     if test.force is None:
         return None
-    return _record(modal, test.force, test.predict_force(structure), test.force_std, 1.0)
+    return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
 
 
 def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: Array, record: _Record) -> Array:

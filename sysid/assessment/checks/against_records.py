@@ -330,7 +330,7 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
 
 def _least_lines(test: Measurement, under_window: float) -> float:
     """Lines that a half-power width holds at least; without what a window makes of peaks, more than one line of it."""
-    return 1.5 if test.window == "taken off" else under_window
+    return 1.0 if test.window == "taken off" else under_window
 
 
 def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
