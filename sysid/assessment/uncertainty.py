@@ -22,6 +22,7 @@ from sysid.assessment.information import (
     changes_of_matrices,
     gain_gradients,
     information,
+    leakage_moves,
     spectra_of,
     spread,
     std_of,
@@ -312,16 +313,16 @@ def moves_by_records(
             (A, B), scattered = uneven, np.inf
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns, scattered)
-    shifts = np.zeros((index.size, 0))
+    plain, shifts = normals if B is None else spread(A, None, path)[0], np.zeros((index.size, 0))
     if gains or modal.calibration is not None:
         if spectra is not None:
             direct = [test.rigid_body, structure.rigid_body_mass]
             pulls = gain_gradients(modes, index, direct, [record.grams(spectra) for record in records])
         else:
             pulls = A @ shifts_about(modal, modes)
-        plain = normals if B is None else spread(A, None, path)[0]
         shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
-    normals = (1.0 if np.isnan(inflation) else inflation) * normals
+    leaked = leakage_moves(test, structure, modes, index, records, plain)
+    normals = np.hstack([(1.0 if np.isnan(inflation) else inflation) * normals, leaked])
     if modal.calibration is not None:
         normals = np.hstack([normals, shifts @ modal.calibration.moves])
     return modes, index, inflation, normals, unseen, shifts, found

@@ -92,7 +92,7 @@ class RecordedTest:
     base_sensors: tuple[BaseSensor, ...] = ()
     response_std: Array | None = None
     force_std: Array | None = None
-    averaged: bool = False
+    averaged: int = False
     window: str = ""
 
     @property

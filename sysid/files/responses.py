@@ -91,7 +91,7 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
     remarks += [*delays_in_words(said), *work_of_force(runs, freq), *words, how]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks),
-        **tolerances_of(said, axes), **std, averaged=said.window != "" or said.averages > 0, window=said.window,
+        **tolerances_of(said, axes), **std, averaged=said.averages or said.window != "", window=said.window,
     )  # fmt: skip
 
 

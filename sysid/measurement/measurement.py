@@ -69,8 +69,8 @@ class Measurement:
         How many lines were left out so, of all records.
     holes : tuple of (str, ndarray)
         What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
-    averaged : bool
-        Averages over segments, as "h1" and "h2" of `from_time` give: their window flattens narrow peaks.
+    averaged : bool or int
+        Averages over segments, of independent blocks as many as are known, as "h1" of `from_time` gives: see `window`.
     window : str
         "hann" of functions H1 under that window, "taken off" without what it makes of their poles, "" of all else.
     whole : WholeRecords, optional
@@ -103,7 +103,7 @@ class Measurement:
     missing: InitVar[Missing] = field(default="refuse", kw_only=True)
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
-    averaged: bool = field(default=False, kw_only=True)
+    averaged: int = field(default=False, kw_only=True)
     window: str = field(default="", kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     sample_rate: float | None = field(default=None, kw_only=True)
@@ -395,7 +395,7 @@ class Measurement:
         options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "missing": missing}
         return cls(
             lines, unit_runs(d, lines.size), by_run[0], force=by_run[1], response_std=by_run[2], force_std=by_run[3],
-            averaged=window != "" or stated, window=window, **options,
+            averaged=averages or window != "", window=window, **options,
         )  # fmt: skip
 
     @classmethod

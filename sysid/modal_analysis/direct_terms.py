@@ -137,8 +137,8 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
     Until that moves no line by more than `near` of its deviation. Poles whose half-power width is less than the
     distance of lines may be noise at one line: what the window makes of these, and by what the last round still moved,
     counts among the errors. So does all that it blurs, where lines are no even ones, no test of functions, show no
-    poles, or are explained worse without it in each round, as where they are not all lines of the blocks: false poles
-    come and go between rounds.
+    poles, or are explained worse without it, by more than a pole of noise that comes or goes, as where they are not all
+    lines of the blocks.
     """
     if test.window != "hann":
         return test
@@ -162,7 +162,7 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
                 break
     except (InputError, np.linalg.LinAlgError):
         lefts = []
-    if not lefts or min(lefts[1:], default=lefts[0]) > lefts[0]:
+    if not lefts or lefts[-1] - lefts[0] > beyond_chance(2 * test.n_runs * (test.n_sensors + test.n_base + 1)):
         rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
         turned = replace(test, window="")
     of_response, of_force = np.split(np.abs(rest), [test.n_sensors], axis=1)
