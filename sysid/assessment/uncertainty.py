@@ -313,7 +313,8 @@ def moves_by_records(
             (A, B), scattered = uneven, np.inf
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns, scattered)
-    plain, shifts = normals if B is None else spread(A, None, path)[0], np.zeros((index.size, 0))
+    plain = normals if B is None else spread(A, None, path)[0]
+    shifts = np.zeros((index.size, 0))
     if gains or modal.calibration is not None:
         if spectra is not None:
             direct = [test.rigid_body, structure.rigid_body_mass]
