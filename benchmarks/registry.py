@@ -250,6 +250,7 @@ BENCHMARKS = (
     Benchmark(
         "channels.unfit", "whole records that no modes fit: no worse than a rigid body or spectra", "10 min", "15 s"
     ),
+    Benchmark("channels.real_frames", "delays, noise and quadrature of two recorded events", "1 min", "10 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 

@@ -86,7 +86,8 @@ plt.show()
 # ## One clock?
 #
 # The stamps of the units are said to be on one clock. Far below its first mode the frame moves as the table does: a
-# floor over the table is nearly one, and its phase zero. A unit that is late by τ shows the phase -ωτ there.
+# floor over the table is nearly one, and its phase zero. A unit that is late by τ shows the phase -ωτ there, and what
+# damping turns (a few tenths of a millisecond) stands beside it.
 
 
 # %%

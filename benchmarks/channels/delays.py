@@ -1,7 +1,7 @@
 """Late channels: whether their delays are found first, how exactly, and that none is found of channels on one clock.
 
 Whole records are sums over modes in closed form, cut in motion: those of a late channel are the same sums at earlier
-times, so that no delay is rounded to a sample. Spectra are turned by ``exp(-i w tau)``.
+times, so that no delay is rounded to a sample. Spectra are such sums too, turned by ``exp(-i w tau)``.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import sysid
+from benchmarks.band.simulated_tests import transfer
 from benchmarks.line import Line, above, below
 from benchmarks.modal.spread import spread
-from benchmarks.records.simulated import Records, Run, Setting, coupled_structure, four_storeys
+from benchmarks.records.simulated import Modes, Records, Run, Setting, coupled_structure, four_storeys
 
 DRAWS, CLEAN = 120, 100
 SHORT = 6
@@ -161,15 +162,17 @@ def _earlier(run: Run, time: float) -> Run:
 
 
 def _spectra(setting: Setting, delays: np.ndarray, rng: np.random.Generator) -> sysid.Measurement:
-    freq = np.linspace(*setting.lines, 500)
-    clean = sysid.simulate(setting.structure, freq, force=True)
-    turn = np.exp(-2j * np.pi * freq * delays[:, None])
+    freq, modes = np.linspace(*setting.lines, 500), Modes.of(setting.structure)
+    turn = np.exp(-2j * np.pi * freq * delays[:, None, None])
     parts = {}
-    for name, record in (("response", clean.response * turn[:-1]), ("force", clean.force * turn[-1])):
+    pairs = zip(transfer(modes, 2 * np.pi * freq), (turn[:-1], turn[-1:]), strict=True)
+    for name, (clean, late) in zip(("response", "force"), pairs, strict=True):
+        record = np.moveaxis(clean * late, 1, 0)  # a run of unit motion along each axis
         std = NOISE * np.sqrt(np.mean(np.abs(record) ** 2, axis=2, keepdims=True))
         real, imaginary = rng.standard_normal((2, *record.shape)) / np.sqrt(2)
         parts |= {name: record + std * (real + 1j * imaginary), f"{name}_std": std}
-    return replace(clean, **parts)
+    base = np.ones((1, 1, freq.size))  # of one axis
+    return sysid.Measurement(freq, base, rigid_body=modes.rigid_body, **parts)
 
 
 def _examples(texts: list[str], most: int = 3) -> str:

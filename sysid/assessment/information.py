@@ -179,8 +179,11 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
 
 
 def _inverse_factor(matrix: Array) -> tuple[Array, Array]:
-    """F with ``F F'`` the inverse of a semidefinite matrix on its range, and an orthonormal basis of the rest."""
-    least = len(matrix) * np.finfo(float).eps
+    """F with ``F F'`` the inverse of a semidefinite matrix on its range, and an orthonormal basis of the rest.
+
+    Round-off adds up by chance: as the root of the size (Higham and Mary, SIAM J. Sci. Comput. 41 (2019) A2815).
+    """
+    least = np.sqrt(len(matrix)) * np.finfo(float).eps
     triangle, singular = scipy.linalg.lapack.dpotrf(matrix, lower=1)
     # Where it is regular this takes a tenth of the time of eigenvalues.
     if not singular and scipy.linalg.lapack.dpocon(triangle, np.linalg.norm(matrix, 1), uplo="L")[0] > least:

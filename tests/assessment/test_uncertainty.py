@@ -14,6 +14,7 @@ import scipy.stats
 
 import sysid
 from sysid import FullMass, Measurement, Problem, SpectralStiffness, Structure
+from sysid.assessment.information import Parametrisation, spread, std_of
 from sysid.assessment.uncertainty import uncertainty
 
 FREQ = np.linspace(2, 66, 90)
@@ -428,3 +429,17 @@ class TestNoiseLevel:
         assert np.all(u.damping_ratios > 0) and np.all(np.isfinite(u.damping))
         low, high = u.interval("damping_ratios")
         assert low[0] < 0 < high[0] and np.all(low[1:] > 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_records_hardly_see_is_told_from_what_they_do_not_see(seed):
+    """Near the round-off of J'J; the reference is the singular values of J."""
+    rng, size = np.random.default_rng(seed), 170
+    columns, moves = (np.linalg.qr(rng.normal(size=(rows, size)))[0] for rows in (3 * size, size))
+    seen = np.append(10.0 ** rng.uniform(-5, 0, size - 2), [1e-7, 0.0])
+    J = (columns * seen) @ moves.T
+    normals, unseen = spread(J.T @ J, None, Parametrisation(np.eye(size), np.ones(size), np.zeros((size, 0))))
+    assert unseen.shape == (size, 1)
+    hardly, never = moves[:, -2:].T
+    np.testing.assert_allclose(np.linalg.norm(hardly @ normals), 1 / (1e-7 * np.sqrt(2)), rtol=0.1)
+    assert np.isnan(std_of(never @ np.hstack([normals, unseen]), normals.shape[1], 1.0))
