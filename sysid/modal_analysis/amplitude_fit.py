@@ -85,6 +85,8 @@ def _stages(
                 yield replace(found, left_out=tuple(left_out))
             elif stated.modes == "auto" and others:
                 break  # no exponents make a law of what gains nothing with the first
+        if others and not best.settled:  # a law's many steps gain by all else too
+            found = _judged(found, [max(best, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
         law = fitted_laws(found)[-1]
         if law.is_certain:
             best = found
@@ -102,7 +104,9 @@ def _stages(
                 refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
                 for p in (_with_equivalents(best), linear.parameters)
             )
-    best = _judged(best, [linear] * len(best.parameters.laws))
+    if plain or len(best.parameters.laws) > 1:
+        best, gone = _holding(best, linear, TRIAL if best.model.whole.plain else WHOLE, monitor)
+        left_out += gone
     yield replace(best if best.parameters.laws else fit, left_out=tuple(left_out))
 
 
@@ -147,6 +151,35 @@ def _judged(fit: RecordFit, others: Sequence[RecordFit]) -> RecordFit:
             likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
         laws.append(law._replace(likelier=likelier))
     return replace(fit, parameters=replace(p, laws=tuple(laws)))
+
+
+def _holding(
+    best: RecordFit, linear: RecordFit, limits: Limits, monitor: FitMonitor
+) -> tuple[RecordFit, list[FittedLaw]]:
+    """The fit with those of its laws that hold beside the others, each against the fit without it alone; the others."""
+    gone: list[FittedLaw] = []
+    while count := len(best.parameters.laws):
+        monitor.doing = "laws of amplitude, each left out"
+        others = [linear] if count == 1 else [_without(best, k, limits, monitor) for k in range(count)]
+        best = _judged(best, others)
+        laws = fitted_laws(best)
+        doubtful = [k for k in range(count) if not laws[k].is_certain]
+        if not doubtful:
+            break
+        gone.append(laws[doubtful[-1]])
+        best = others[doubtful[-1]]
+    return best, gone
+
+
+def _without(fit: RecordFit, number: int, limits: Limits, monitor: FitMonitor) -> RecordFit:
+    """The fit without one of its laws, from what its mode is at the mean of the runs."""
+    p = _with_equivalents(fit)
+    law, followed = p.laws[number], np.arange(fit.model.m) == p.laws[number].mode
+    by = np.where(followed, law.equivalent.mean(axis=0)[:, None], 1.0)
+    modes = p.modes._replace(omega=p.modes.omega * by[0], ratios=p.modes.ratios * by[1])
+    ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode without a law they are no state
+    begun = replace(p, modes=modes, ends=ends, laws=tuple(one for one in p.laws if one is not law))
+    return refitted(fit, begun, limits=limits, monitor=monitor)
 
 
 def _of_lines(fit: RecordFit) -> Array:
