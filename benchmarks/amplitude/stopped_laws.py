@@ -43,7 +43,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             if left[0] <= 0:
                 raise end("stopped")
 
-        found, _ = with_laws(linear, asked, left_of, monitor=FitMonitor(stop))
+        found = with_laws(linear, asked, left_of, monitor=FitMonitor(stop))
         laws = found.parameters.laws
         faults = {
             "not told": not found.stopped,

@@ -191,7 +191,7 @@ def _level_in_words(content: Content) -> Iterator[str]:
     """The level of the matrices, where modes follow their amplitude, law by law."""
     it, level = content.it, content.level
     for law in it.structure.laws:
-        mode, low, high = it.structure.mode_of(law) + 1, *law.levels
+        mode, low, high = law.mode + 1, *law.levels
         frequency, ratio = law.at(level or 0.0)
         where = f"at {level:.6g} m/s2" if level is not None else "at rest"
         beyond = level is not None and not low <= level <= high

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -34,8 +34,8 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 def with_laws(
     fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], *, monitor: FitMonitor,
     much: float = 0.1, tries: tuple[float, ...] = (0.0, 0.03),
-) -> tuple[RecordFit, tuple[FittedLaw, ...]]:  # fmt: skip
-    """The fit with laws of the stated modes, numbered from 1 by frequency within the lines, and laws that do not pay.
+) -> RecordFit:  # fmt: skip
+    """The fit with laws of the stated modes, numbered from 1 by frequency within the lines; `left_out` are the others.
 
     Laws come mode by mode, each of exponents of its own. One that the likelihood takes stands in the fit as the next is
     tried; one that it does not is left out of it. "auto" goes on from the first mode where that has a law.
@@ -49,28 +49,22 @@ def with_laws(
     InputError
         Where there is no such mode.
     """
-    stages: list[tuple[RecordFit, RecordFit]] = []
-    rest: list[FittedLaw] = []
+    best = fit
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            for stage in _stages(fit, stated, left_of, rest, monitor, much, tries):
-                stages.append(stage)
+            for stage in _stages(fit, stated, left_of, monitor, much, tries):
+                best = stage
     except (Stop, KeyboardInterrupt):
-        so_far = _judged(*stages[-1]) if stages else fit
-        likelier = any(law.likelier for law in so_far.parameters.laws)
-        return replace(so_far if likelier else fit, stopped=True), tuple(rest)
-    return _judged(*stages[-1]), tuple(rest)
+        return replace(best, stopped=True)
+    return best
 
 
 def _stages(
-    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], rest: list[FittedLaw],
-    monitor: FitMonitor, much: float, tries: tuple[float, ...],
-) -> Iterator[tuple[RecordFit, RecordFit]]:  # fmt: skip
-    """The likeliest fit with laws so far, and the linear one that it is judged by, better from stage to stage.
-
-    Laws that do not pay are added to `rest`.
-    """
+    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], monitor: FitMonitor, much: float,
+    tries: tuple[float, ...],
+) -> Iterator[RecordFit]:  # fmt: skip
+    """The fit with laws that are likelier than none, from stage to stage; the fit itself as long as there are none."""
     whole = fit.model.whole
     plain = left_of(fit) > much or whole.plain
     whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
@@ -82,20 +76,23 @@ def _stages(
     if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
         best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
+    left_out: list[FittedLaw] = []
     for omega in linear.parameters.modes.omega[modes]:
-        found = best
+        found, others = best, bool(best.parameters.laws)
         for found in _with_law_of(best, omega, stated.exponents, tries, limits, monitor):
-            if not best.parameters.laws:  # further laws are judged alone, at their end
-                yield found, linear
-            found = _judged(found, best if best.parameters.laws else linear, since=len(best.parameters.laws))
-            if stated.modes == "auto" and best.parameters.laws and not found.parameters.laws[-1].likelier:
+            found = _judged(found, [best if others else linear])
+            if found.parameters.laws[-1].likelier:
+                yield replace(found, left_out=tuple(left_out))
+            elif stated.modes == "auto" and others:
                 break  # no exponents make a law of what gains nothing with the first
+        if others and not best.settled:  # a law's many steps gain by all else too
+            found = _judged(found, [max(best, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
         law = fitted_laws(found)[-1]
         if law.is_certain:
             best = found
-            yield best, linear
         else:
-            rest.append(law)
+            left_out.append(law)
+            yield replace(best if others else fit, left_out=tuple(left_out))
         if stated.modes == "auto" and not best.parameters.laws:
             break
     if plain and best.parameters.laws:
@@ -107,7 +104,10 @@ def _stages(
                 refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
                 for p in (_with_equivalents(best), linear.parameters)
             )
-    yield best, linear
+    if plain or len(best.parameters.laws) > 1:
+        best, gone = _holding(best, linear, TRIAL if best.model.whole.plain else WHOLE, monitor)
+        left_out += gone
+    yield replace(best if best.parameters.laws else fit, left_out=tuple(left_out))
 
 
 def _with_law_of(
@@ -126,33 +126,60 @@ def _with_law_of(
             break
     best = max(started, key=lambda one: one.schwarz)
     yield best
-    kinds: tuple[Literal["of_frequency", "of_damping"], ...] = ("of_frequency", "of_damping")
-    for kind, each in zip(kinds, (OF_FREQUENCY, OF_DAMPING), strict=True) if exponents == "auto" else ():
-        for exponent in (one for one in each if one != first[kinds.index(kind)]):
-            monitor.doing = f"{which}, exponent {exponent:g} {kind.replace('_', ' ')}"
-            found = refitted(best, _with_exponent(best, kind, exponent), limits=limits, monitor=monitor)
+    for number, each in enumerate((OF_FREQUENCY, OF_DAMPING) if exponents == "auto" else ()):
+        for exponent in (one for one in each if one != first[number]):
+            monitor.doing = f"{which}, exponent {exponent:g} {LawForm._fields[number].replace('_', ' ')}"
+            found = refitted(best, _with_exponent(best, number, exponent), limits=limits, monitor=monitor)
             if found.likelihood > best.likelihood:
                 best = found
         yield best
 
 
-def _judged(best: RecordFit, without: RecordFit, since: int = 0) -> RecordFit:
-    """The fit, whose laws `since` one are told to be likelier than the fit without these, or not, beyond chance.
+def _judged(fit: RecordFit, others: Sequence[RecordFit]) -> RecordFit:
+    """The fit, whose last laws are told to be likelier than the fits without each of them, or not, beyond chance.
 
     Squares take the base as exact, and what its noise does at a few lines near a peak passes for what a law does: there
     the gain must also be beyond its scatter from line to line (Vuong, Econometrica 57 (1989) 307-333).
     """
-    p = best.parameters
-    if not p.laws:
-        return best
-    numbers = sum(law.form.size for law in p.laws[since:])
-    gained = 2 * (best.likelihood - without.likelihood) / _shared(best)
-    likelier = gained > beyond_chance(numbers, len(OF_FREQUENCY) + len(OF_DAMPING))
-    if likelier and best.model.whole.plain:
-        each = _of_lines(best) - _of_lines(without)
-        likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
-    judged = tuple(law._replace(likelier=likelier) for law in p.laws[since:])
-    return replace(best, parameters=replace(p, laws=(*p.laws[:since], *judged)))
+    p, first = fit.parameters, len(fit.parameters.laws) - len(others)
+    laws = list(p.laws[:first])
+    for law, without in zip(p.laws[first:], others, strict=True):
+        gained = 2 * (fit.likelihood - without.likelihood) / _shared(fit)
+        likelier = gained > beyond_chance(law.form.size, len(OF_FREQUENCY) + len(OF_DAMPING))
+        if likelier and fit.model.whole.plain:
+            each = _of_lines(fit) - _of_lines(without)
+            likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
+        laws.append(law._replace(likelier=likelier))
+    return replace(fit, parameters=replace(p, laws=tuple(laws)))
+
+
+def _holding(
+    best: RecordFit, linear: RecordFit, limits: Limits, monitor: FitMonitor
+) -> tuple[RecordFit, list[FittedLaw]]:
+    """The fit with those of its laws that hold beside the others, each against the fit without it alone; the others."""
+    gone: list[FittedLaw] = []
+    while count := len(best.parameters.laws):
+        monitor.doing = "laws of amplitude, each left out"
+        others = [linear] if count == 1 else [_without(best, k, limits, monitor) for k in range(count)]
+        best = _judged(best, others)
+        laws = fitted_laws(best)
+        doubtful = [k for k in range(count) if not laws[k].is_certain]
+        if not doubtful:
+            break
+        gone.append(laws[doubtful[-1]])
+        best = others[doubtful[-1]]
+    return best, gone
+
+
+def _without(fit: RecordFit, number: int, limits: Limits, monitor: FitMonitor) -> RecordFit:
+    """The fit without one of its laws, from what its mode is at the mean of the runs."""
+    p = _with_equivalents(fit)
+    law, followed = p.laws[number], np.arange(fit.model.m) == p.laws[number].mode
+    by = np.where(followed, law.equivalent.mean(axis=0)[:, None], 1.0)
+    modes = p.modes._replace(omega=p.modes.omega * by[0], ratios=p.modes.ratios * by[1])
+    ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode without a law they are no state
+    begun = replace(p, modes=modes, ends=ends, laws=tuple(one for one in p.laws if one is not law))
+    return refitted(fit, begun, limits=limits, monitor=monitor)
 
 
 def _of_lines(fit: RecordFit) -> Array:
@@ -183,7 +210,8 @@ def _modes_of(fit: RecordFit, stated: AmplitudeLaw) -> list[int]:
 def _like(modes: Modes, k: int, assurance: float = 0.9, reach: float = 0.2) -> NDArray[np.bool_]:
     """True of modes that may be mode k at other levels, (m,), itself too: of its shape, within what a law may move.
 
-    A linear fit shows a mode that changes once for each level, or twice near one frequency.
+    A linear fit shows a mode that changes once for each level, or twice near one frequency. The reach is wider than
+    that of the check of stretches (`ObservedPoles`): here the likelihood has the last word, there none has.
     """
     near = np.abs(np.log(modes.omega / modes.omega[k])) < reach
     if len(modes.phi) == 1:  # all are of one shape
@@ -237,8 +265,8 @@ def _started(
     return refitted(best, _with_equivalents(best), limits=limits, monitor=monitor)
 
 
-def _with_exponent(fit: RecordFit, which: Literal["of_frequency", "of_damping"], exponent: float) -> Parameters:
-    """The parameters with another exponent of the last law, which says what it said at two levels.
+def _with_exponent(fit: RecordFit, number: int, exponent: float) -> Parameters:
+    """The parameters with another exponent of the last law, by its number in the form, for what it said at two levels.
 
     One is exceeded most of the time, one hardly ever: from other values damping may be zero at all low levels, where
     no step shows.
@@ -246,15 +274,15 @@ def _with_exponent(fit: RecordFit, which: Literal["of_frequency", "of_damping"],
     p = _with_equivalents(fit)
     law, omega, ratios = p.laws[-1], p.modes.omega.copy(), p.modes.ratios.copy()
     unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
-    number, values, pole = ("of_frequency", "of_damping").index(which), law.values.copy(), [1.0, 1.0]
-    before, after = unit ** getattr(law.form, which), unit**exponent
+    values, pole = law.values.copy(), [1.0, 1.0]
+    before, after = unit ** law.form[number], unit**exponent
     values[number] *= (before[1] - before[0]) / (after[1] - after[0])
     beside = law.values[number] * before[1] - values[number] * after[1]  # what is left is of any level
     pole[number] = max(1 + beside / ratios[law.mode], 0.1) if number else 1 - beside
     values[0] /= pole[0]
     omega[law.mode] *= pole[0]
     ratios[law.mode] *= pole[1]
-    form = law.form._replace(**{which: exponent})
+    form = law.form._replace(**{LawForm._fields[number]: exponent})
     law = law._replace(form=form, values=values, equivalent=law.equivalent / pole)
     return replace(p, modes=p.modes._replace(omega=omega, ratios=ratios), laws=(*p.laws[:-1], law))
 
@@ -321,11 +349,8 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
     covariance = half @ half.T / np.outer(size, size) / 2 * _shared(fit)
     first = model.of_laws.start
     for law in p.laws:
-        at = [
-            model.index.log_omega.start + law.mode,
-            model.index.log_ratios.start + law.mode,
-            *range(first, first + law.form.size),
-        ]
+        poles = model.index.log_omega.start, model.index.log_ratios.start
+        at = [*(start + law.mode for start in poles), *range(first, first + law.form.size)]
         first += law.form.size
         omega, ratio = float(p.modes.omega[law.mode]), float(p.modes.ratios[law.mode])
         found.append(

@@ -427,9 +427,7 @@ def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMo
 
 
 def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw | None, monitor: FitMonitor) -> ModalEstimate:
-    """The estimate of whole records with laws of the stated modes, which are its modes' where one of them is certain.
-
-    Itself where none are asked for.
+    """The estimate of whole records with laws of the stated modes; itself where none are asked for.
 
     Raises
     ------
@@ -441,11 +439,10 @@ def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw | None, monitor:
         return modal
     monitor.begin(1)
     with one_thread():
-        found, rest = with_laws(fit, stated, left_of, monitor=monitor)
-        laws = fitted_laws(found)
-        if any(law.is_certain for law in laws) or found.stopped:
-            modal = estimate(found, modal.calibration)
-    return replace(modal, laws=(*laws, *rest))
+        found = with_laws(fit, stated, left_of, monitor=monitor)
+    if found.parameters.laws or found.stopped:
+        return estimate(found, modal.calibration)
+    return replace(modal, record_fit=found, laws=found.left_out)
 
 
 def without_transients(fit: RecordFit) -> Measurement:
@@ -486,6 +483,6 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         excess_of(fit), varying_levels(fit), runs_in_motion(fit),
         () if fit.model.whole.plain else unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
-        delays=delays_of(fit), calibration=calibration, laws=fitted_laws(fit),
+        delays=delays_of(fit), calibration=calibration, laws=(*fitted_laws(fit), *fit.left_out),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

@@ -188,7 +188,7 @@ def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray
         structure.damping_ratios,
     )  # fmt: skip
     ones = np.ones((test.n_runs, 2))
-    laws = tuple(ModeLaw(structure.mode_of(law), law.sensor, law.form, law.values, ones) for law in structure.laws)
+    laws = tuple(ModeLaw(law.mode, law.sensor, law.form, law.values, ones) for law in structure.laws)
     motions = LawMotions(test)
     ends = np.zeros((structure.n, 2 * sum(not rest for rest in motions.at_rest)))
     p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)

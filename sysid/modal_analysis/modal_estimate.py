@@ -259,10 +259,9 @@ class ModalEstimate:
         inner = np.linalg.pinv(A[np.ix_(~ours, ~ours)] / np.outer(size, size), hermitian=True) / np.outer(size, size)
         turn = np.eye(ours.size)[ours]
         turn[:, ~ours] = -A[np.ix_(ours, ~ours)] @ inner
-        laws = tuple(law for law in self.laws if kept[law.mode_among(self.omega / (2 * np.pi), np.inf)])
         coupling = self.coupling and self.coupling.at(kept, ours, inner, A[np.ix_(~ours, ours)])
         return replace(
-            self, coupling=coupling, laws=laws, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,
+            self, coupling=coupling, **self.modes.at(kept)._asdict(), information=turn @ A @ turn.T,
             scatter=None if B is None else turn @ B @ turn.T, gain=replace(self.gain, moves=self.gain.moves[ours]),
         )  # fmt: skip
 

@@ -36,7 +36,7 @@ from sysid.modal_analysis.record_model import (
     RecordModel,
 )
 from sysid.modal_analysis.residues import Records
-from sysid.structure.amplitude import LawForm
+from sysid.structure.amplitude import FittedLaw, LawForm, laws_from_tree, laws_to_tree
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -77,6 +77,8 @@ class RecordFit:
         So many modes, the last, stand for all above the lines: see `ModalFit`.
     kept : (m,) or None
         Modes that the estimate has, where fewer were asked for than the records show.
+    left_out : tuple of FittedLaw
+        Laws of amplitude that were tried and do not hold.
     """
 
     test: Measurement
@@ -87,6 +89,7 @@ class RecordFit:
     stopped: bool = False
     static: int = 0
     kept: NDArray[np.bool_] | None = None
+    left_out: tuple[FittedLaw, ...] = ()
 
     @cached_property
     def model(self) -> RecordModel:
@@ -188,7 +191,7 @@ class RecordFit:
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
             "varying": whole.varying, "kept": self.kept, "coupling": p.coupling,
-            "gains": p.gains, "plain": whole.plain, "grows": whole.grows,
+            "left_out": laws_to_tree(self.left_out), "gains": p.gains, "plain": whole.plain, "grows": whole.grows,
             "profile": getattr(whole, "profile", None), "taken": whole.taken if whole.grows else None,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
         }  # fmt: skip
@@ -214,19 +217,19 @@ class RecordFit:
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
         laws = tuple(ModeLaw(**{**law, "form": LawForm(*law["form"].tolist())}) for law in tree.get("laws") or ())
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
-        fit = cls(test, p, tree["levels"], tree["chi2"], tree["settled"], tree["stopped"], tree["static"], kept)
+        ended = {name: tree[name] for name in ("levels", "chi2", "settled", "stopped", "static")}
+        fit = cls(test, p, **ended, kept=kept, left_out=laws_from_tree(tree.get("left_out")))
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
-        parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains]
+        parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains, *(law.values for law in laws)]
         shapes: list[tuple[int, ...]] = [
             (model.n, m), (m, model.d), (m,), (m,), (model.d, model.d), (m, 2 * len(model.moving)),
             (test.n_runs, c, trace_count(test)), (len(model.runs), (c + model.d) * (1 + model.whole.grows)),
-            (model.by_gains.shape[2],),
+            (model.by_gains.shape[2],), *((law.form.size,) for law in laws),
         ]  # fmt: skip
         sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
         sound &= all(law.mode in range(m) and law.sensor in range(model.n) for law in laws)
         sound &= all(law.equivalent.shape == (test.n_runs, 2) and bool(np.all(law.equivalent > 0)) for law in laws)
-        sound &= all(law.values.shape == (law.form.size,) and bool(np.all(np.isfinite(law.values))) for law in laws)
         sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))
         return fit

@@ -367,13 +367,13 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     legend_below(ax, ax.get_lines(), 4)
 
 
-def draw_law(row: Sequence[Axes], law: FittedLaw, mode: int, stretches: Sequence[tuple[Stretch, int]]) -> None:
-    """Frequency and damping of a law into two axes, beside those of stretches, each with the mode's index there."""
-    low, high = law.levels
-    seen = [(one, k) for one, k in stretches if one.std[k] < one.ratio[k] * one.frequency[k]]  # others tell nothing
-    at = np.array([np.sqrt(2) * one.level[k] for one, k in seen])
+def draw_law(row: Sequence[Axes], law: FittedLaw, stretches: Sequence[Stretch]) -> None:
+    """Frequency and damping of a law into two axes, beside those of stretches, of all modes of its structure."""
+    (low, high), k = law.levels, law.mode
+    seen = [one for one in stretches if one.std[k] < one.ratio[k] * one.frequency[k]]  # others tell nothing
+    at = np.array([np.sqrt(2) * one.level[k] for one in seen])
     of_stretches = np.array([
-        ((one.frequency[k], one.std[k]), (100 * one.ratio[k], 100 * one.ratio_std[k])) for one, k in seen
+        ((one.frequency[k], one.std[k]), (100 * one.ratio[k], 100 * one.ratio_std[k])) for one in seen
     ]).reshape(-1, 2, 2)  # fmt: skip
     levels = np.geomspace(low / 1.5, 1.2 * high, 120)
     values = np.array([law.at(level) for level in levels]).T * [[1], [100]]
@@ -389,7 +389,7 @@ def draw_law(row: Sequence[Axes], law: FittedLaw, mode: int, stretches: Sequence
         ax.set_xscale("log")
         ax.set_xlim(levels[0], levels[-1])
         plain_log(ax.xaxis)
-        dress(ax, f"Mode {mode}", "", what)
+        dress(ax, f"Mode {k + 1}", "", what)
 
 
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:

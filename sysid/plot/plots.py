@@ -413,8 +413,7 @@ def amplitude(identification: Identification) -> Figure:
         stretches = []
     figure = new_figure(9.0, 3.4 * len(structure.laws))
     for row, law in zip(figure.subplots(len(structure.laws), 2, squeeze=False), structure.laws, strict=True):
-        k = structure.mode_of(law)
-        draw_law(row, law, k + 1, [(one, k) for one in stretches])
+        draw_law(row, law, stretches)
     legend_below(row[0], row[0].get_legend_handles_labels()[0], 2)
     for ax in row:
         ax.set_xlabel("level of the mode [m/s²]")

@@ -245,8 +245,8 @@ class Prepared(SearchSpace):
         if count is not None:
             more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
-            laws, modal = self.modal[0].laws, estimate(more, self.modal[0].calibration)
-            self.modal = (modal if modal.laws else replace(modal, laws=laws), *self.modal[1:])
+            more = replace(more, left_out=fit.left_out)
+            self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
 
     def fit_modes(self, monitor: FitMonitor) -> None:
         """Fit the modes of each test, and the laws that are asked for to the problem's own whole records."""

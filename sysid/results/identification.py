@@ -250,7 +250,7 @@ class Identification(Answer):
             "residual_modes": {"count": s.residual.count, "static": s.residual.static, "share_of_response": share},
             "amplitude_laws": [
                 {
-                    "mode": s.mode_of(law) + 1,
+                    "mode": law.mode + 1,
                     "sensor": test.sensor_names[law.sensor],
                     **law.form._asdict(),
                     "values": law.values.tolist(),

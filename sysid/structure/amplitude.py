@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -131,6 +131,8 @@ class FittedLaw:
         Of the logarithms of frequency and ratio, and of the values.
     likelier : bool
         Whether the fit with the law is likelier than that without, beyond chance.
+    mode : int
+        Index of its mode among those of the structure that holds it.
     """
 
     frequency: float
@@ -141,6 +143,7 @@ class FittedLaw:
     levels: tuple[float, float]
     covariance: Array
     likelier: bool
+    mode: int = 0
 
     @property
     def is_certain(self) -> bool:
@@ -151,8 +154,8 @@ class FittedLaw:
         away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
         return self.likelier and away > beyond_chance(self.values.size)
 
-    def mode_among(self, frequencies: Array, within: float = 0.1) -> int:
-        """Index of its mode among those of a structure, Hz: the nearest, `within` this share of its frequency.
+    def among(self, frequencies: Array, within: float = 0.1) -> FittedLaw:
+        """The law of the nearest mode of a structure, Hz, `within` this share of its frequency.
 
         Raises
         ------
@@ -166,7 +169,7 @@ class FittedLaw:
                 f"laws: the structure has no mode near {self.frequency:.4g} Hz, which the law is of (the nearest is "
                 f"{frequencies[k]:.4g} Hz): leave the law out (with_laws), or keep its mode"
             )
-        return k
+        return replace(self, mode=k)
 
     def at(self, level: float) -> tuple[float, float]:
         """Frequency, Hz, and damping ratio at a level, m/s²."""

@@ -120,7 +120,6 @@ class Structure:
         residual: ResidualModes | None = None,
         laws: Sequence[FittedLaw] = (),
     ) -> None:
-        self.laws = tuple(laws)
         self.mass = symmetric_array("mass", mass, "n + d", EXACT)
         self.stiffness = symmetric_array("stiffness", stiffness, "n + d", EXACT)
         if self.mass.shape != self.stiffness.shape:
@@ -141,6 +140,7 @@ class Structure:
         self.normal_modes: Array = phi * np.sign(phi[np.argmax(np.abs(phi), axis=0), np.arange(n)])
         self.natural_frequencies: Array = self._omega / (2 * np.pi)
         self._set_damping(damping_ratios, damping_matrix)
+        self._set_laws(laws)
 
         self.recovery: Array = np.eye(n) if recovery is None else shaped_array("recovery", recovery, "n_sensors", n)
         self.rigid_body: Array = self._sensor_rigid_body(rigid_body, recovery is not None)
@@ -175,14 +175,13 @@ class Structure:
     def with_laws(self, laws: Sequence[FittedLaw]) -> Structure:
         """The same structure with modes that follow their amplitude."""
         other = copy(self)
-        other.laws = tuple(laws)
-        modes = [other.mode_of(law) for law in other.laws]
-        refuse((len(set(modes)) < len(modes), "laws: two of them are of one mode, the nearest in frequency: keep one"))
+        other._set_laws(laws)
         return other
 
-    def mode_of(self, law: FittedLaw) -> int:
-        """Index of the mode that a law is of; an `InputError` where it is gone."""
-        return law.mode_among(self.natural_frequencies)
+    def _set_laws(self, laws: Sequence[FittedLaw]) -> None:
+        self.laws = tuple(law.among(self.natural_frequencies) for law in laws)
+        twice = len({law.mode for law in self.laws}) < len(self.laws)
+        refuse((twice, "laws: two of them are of one mode, the nearest in frequency: keep one"))
 
     def at_level(self, level: float) -> Structure:
         """The linear structure that moves as this one does where its modes with a law move at a level, m/s².
@@ -192,7 +191,7 @@ class Structure:
         level = as_float("level", level, "m/s², >= 0", at_least=0)
         K, C = self.stiffness.copy(), self.damping.copy()
         for law in self.laws:
-            k = self.mode_of(law)
+            k = law.mode
             row = self.normal_modes[:, k] @ self.mass[: self.n, : self.n]
             both = np.append(row, -row @ self.rigid_body_dofs)
             of_stiffness, of_damping = law.changes_at(level, self._omega[k], self.damping_ratios[k])
@@ -402,7 +401,7 @@ class Structure:
             state[:, : self.n] = np.linalg.solve(self._turned[1], shaped_array("initial", initial, 2, self.n).T).T
         modal = modal_accelerations(self._modal_model, motion, rate, state)
         for law in self.laws:
-            k = self.mode_of(law)
+            k = law.mode
             mode = self._omega[k], self.damping_ratios[k], self.mode_shapes[law.sensor, k]
             modal[k] = modal_acceleration(law, mode, self.participation[k] @ motion, rate, state[:, k])
         return motion, modal

@@ -1,5 +1,6 @@
 """Laws of amplitude as a term of the model of whole records: exact derivatives, and what records tell of them."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,21 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.modal_analysis.amplitude_fit import _envelopes, _modes_of, _with_exponent, fitted_laws, with_laws
+from sysid.modal_analysis.amplitude_fit import (
+    _envelopes,
+    _holding,
+    _judged,
+    _modes_of,
+    _started,
+    _with_exponent,
+    _without,
+    fitted_laws,
+    with_laws,
+)
 from sysid.modal_analysis.fit import fit_modes, follow_amplitude, left_of
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
-from sysid.modal_analysis.record_fit import record_modes
+from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
 from sysid.structure.amplitude import LawForm
 
 RATE, FALL, RISE, LEVEL = 40.0, 0.06, 0.012, 12.0
@@ -164,7 +175,7 @@ def test_a_mode_that_shows_at_several_levels_has_one_law(test):
     """As the linear fit of a long test of levels 1:10 has three poles of one mode."""
     fit = record_modes(test, OMEGA[[0, 0, 0, 1]] * [0.93, 0.96, 1.0, 1.0], RATIOS[[0, 0, 0, 1]])
     assert fit.model.m == 4
-    found, _ = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
     (law,) = fitted_laws(found)
     assert found.model.m == 2  # and so two sensors have as many modes as there are
     scale = LEVEL / law.form.level
@@ -180,9 +191,45 @@ def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
     added = 0.3 * w**2 / (beside**2 - w**2 + 0.04j * beside * w) * test.base
     both = replace(test, response=test.response + PHI[:, :1] * added)
     fit = record_modes(both, np.append(OMEGA, beside), np.append(RATIOS, 0.02))
-    found, _ = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
     assert np.sort(found.parameters.modes.omega) / (2 * np.pi) == pytest.approx([3.0, 3.3, 8.0], rel=1e-3)
     assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0], rel=1e-3)
+
+
+def test_a_law_is_judged_against_the_fit_without_it_alone(test):
+    """The first mode has a law, which gains enough for two; a law of the second, linear one is left out beside it."""
+    monitor, linear = FitMonitor(), fit_modes(test).record_fit
+    true = with_laws(linear, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=monitor)
+    second = int(np.argmax(true.parameters.modes.omega))
+    both = _started(true, second, (0.5, 1.0), (0.0,), WHOLE, monitor)
+    held, gone = _holding(both, linear, WHOLE, monitor)
+    assert [law.frequency for law in fitted_laws(held)] == pytest.approx([3.0], rel=1e-3)
+    assert [law.frequency for law in gone] == pytest.approx([8.0], rel=1e-3)
+    assert held.likelihood == pytest.approx(true.likelihood, abs=0.1)
+
+
+def test_a_law_gains_nothing_by_steps_that_the_fit_without_it_has_not_taken():
+    monitor, linear = FitMonitor(), fit_modes(test_of((0.3, 3.0), law=False, samples=600)).record_fit
+    p = linear.parameters
+    off = replace(p, modes=p.modes._replace(omega=1.03 * p.modes.omega))
+    few = refitted(linear, off, limits=Limits(1, 1))
+    law = _started(few, 0, (0.5, 1.0), (0.0,), ROUGH, monitor)
+    without = _without(law, 0, ROUGH, monitor)
+    assert without.likelihood == pytest.approx(linear.likelihood, abs=0.1)
+    likelier = [_judged(law, [other]).parameters.laws[0].likelier for other in (few, without)]
+    assert likelier == [True, False]
+
+
+def test_laws_that_were_left_out_stay_where_the_fit_goes_on(answer, monkeypatch):
+    """As where modes that stand for all above the lines are added."""
+    prepared = copy(answer.prepared)
+    laws = [law.likelier for law in prepared.modal[0].laws]
+    assert laws == [True, False]
+    more = refitted(prepared.modal[0].record_fit, prepared.modal[0].record_fit.parameters, limits=ROUGH)
+    monkeypatch.setattr("sysid.problem.prepared.with_static_modes", lambda fit, monitor: more)
+    prepared.fit_records(None, FitMonitor())
+    assert prepared.modal[0].record_fit.parameters is more.parameters
+    assert [law.likelier for law in prepared.modal[0].laws] == laws
 
 
 def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(test, answer):
@@ -206,6 +253,7 @@ def test_a_stored_answer_keeps_its_law(answer, tmp_path):
     again = sysid.load(answer.save(tmp_path / "result.h5"))
     assert again.structure.laws[0].at(4.0) == answer.structure.laws[0].at(4.0)
     assert again.problem.amplitude == answer.problem.amplitude
+    assert [law.likelier for law in again.prepared.modal[0].laws] == [True, False]  # one was left out
     assert again.prepared.modal[0].omega == pytest.approx(answer.prepared.modal[0].omega, rel=1e-12)
     assert again.residual == pytest.approx(answer.residual, rel=1e-9)
 
@@ -237,13 +285,13 @@ def test_a_level_of_a_structure_without_laws_is_refused(test, tmp_path):
         sysid.export(plain, tmp_path / "there.csv", level=2.5)
 
 
-@pytest.mark.parametrize(("which", "exponent"), [("of_frequency", 2.0), ("of_damping", -1.0), ("of_damping", 2.0)])
-def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, which, exponent):
+@pytest.mark.parametrize(("number", "exponent"), [(0, 2.0), (1, -1.0), (1, 2.0)])
+def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, number, exponent):
     fit = record_modes(test, OMEGA, RATIOS)
     law = ModeLaw(0, 1, LawForm(0.5, 0.5, 400.0), np.array([0.05, -0.004]), np.ones((2, 2)))
     p = replace(fit.parameters, laws=(law,))
     fit = replace(fit, parameters=p)
-    other = _with_exponent(fit, which, exponent)
+    other = _with_exponent(fit, number, exponent)
     levels = np.quantile(np.concatenate(_envelopes(fit, 0, 1)), (0.3, 0.95))
 
     def at(p, level):
@@ -253,7 +301,7 @@ def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, which, ex
 
     for level in levels:
         assert np.allclose(at(p, level), at(other, level), rtol=1e-9)
-    assert getattr(other.laws[0].form, which) == exponent
+    assert other.laws[0].form[number] == exponent
 
 
 def test_a_fit_that_is_stopped_keeps_the_best_so_far(test):
@@ -310,4 +358,5 @@ def test_a_law_of_a_mode_that_the_answer_has_not_is_told_and_left_out():
     result = sysid.identify(sysid.Problem(test, amplitude=law), strategy=sysid.Modal(modes=1), rng=0)
     assert result.structure.n == 1
     assert not result.structure.laws
+    assert not any(one.kind == "amplitude law" for one in result.findings)
     assert [one.severity for one in result.findings if one.kind == "amplitude open"] == ["caution"]

@@ -473,10 +473,9 @@ def test_a_law_of_amplitude_is_drawn_for_each_mode_that_has_one_and_else_refused
         f, zeta = np.array([law.at(level) for level in levels]).T
         rms, size = levels / np.sqrt(2), np.full(1, 1e-3)
         seen = [
-            (Stretch(0, 0.0, 1.0, f[i : i + 1], size, zeta[i : i + 1], size, rms[i : i + 1], 0.0, 0.0), 0)
-            for i in range(4)
+            Stretch(0, 0.0, 1.0, f[i : i + 1], size, zeta[i : i + 1], size, rms[i : i + 1], 0.0, 0.0) for i in range(4)
         ]
-        draw_law(row, law, 1, seen)
+        draw_law(row, law, seen)
         for ax, expected in zip(row, (f, 100 * zeta), strict=True):
             curve, points = ax.get_lines()[:2]
             np.testing.assert_allclose(points.get_data(), (levels, expected))

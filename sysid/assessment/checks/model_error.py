@@ -259,7 +259,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
     for law in context.modal.laws:
-        mode = law.mode_among(context.modal.omega / (2 * np.pi), np.inf) + 1
+        try:
+            mode = law.among(context.end.structure.natural_frequencies).mode + 1
+        except InputError:  # no mode of the answer
+            continue
         low, high = law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
