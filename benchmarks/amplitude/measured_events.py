@@ -23,11 +23,12 @@ def lines(reduced: bool) -> Iterator[Line]:
     own, names = [], EVENTS[:1] if reduced else EVENTS
     for name in names:
         law = sysid.AmplitudeLaw(exponents=(0.5, 0.5)) if reduced else sysid.AmplitudeLaw()
-        result = sysid.identify(sysid.Problem(tests[name], amplitude=law), rng=0)
+        result, linear = (sysid.identify(sysid.Problem(tests[name], amplitude=asked), rng=0) for asked in (law, None))
         other = next(one for one in EVENTS if one != name)
         own.append(float(np.mean(score_of(result.predict(tests[name]), tests[name].relative))))
         unseen = score_of(result.predict(tests[other]), tests[other].relative)
-        scores = " / ".join(f"{one:.3f}" for one in unseen)
+        beside = float(np.mean(score_of(linear.predict(tests[other]), tests[other].relative)))
+        scores = f"{' / '.join(f'{one:.3f}' for one in unseen)}; linear {beside:.3f}"
         yield above(f"fitted on {name}: mean score of {other}, never fitted ({scores})", float(np.mean(unseen)), 0.6)
     each = " and ".join(f"{one:.3f}" for one in own)
     yield above(f"mean score of the fitted event, relative X ({each})", float(np.mean(own)), 0.8)

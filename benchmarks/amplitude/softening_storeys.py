@@ -58,16 +58,16 @@ class Storeys:
         q = (phi.T @ self.mass)[:, None] / (w[:, None] ** 2 - omega**2 + 2j * (self.ratios * w)[:, None] * omega)
         return float(level * np.sqrt(np.mean(np.abs(np.diff(phi @ q, axis=0, prepend=0.0)) ** 2, axis=1).max()))
 
-    def under(self, bases: Array) -> Array:
+    def under(self, bases: Array, rate: float = RATE) -> Array:
         """Absolute accelerations (r, n, N) under base accelerations (r, N) of runs, from rest, all in one system."""
         fine = scipy.signal.resample(bases, 8 * bases.shape[1], axis=1)
-        t, u = np.arange(bases.shape[1]) / RATE, CubicSpline(np.arange(fine.shape[1]) / (8 * RATE), fine, axis=1)
+        t, u = np.arange(bases.shape[1]) / rate, CubicSpline(np.arange(fine.shape[1]) / (8 * rate), fine, axis=1)
         slope = self._modal_slope() if self.kind == "law" else self._slope()
         n, r = self.mass.size, len(bases)
         shape = (2 * n + n * (self.kind in YIELDING), r)
         motion = solve_ivp(
             lambda at, y: slope(y.reshape(shape), u(at)).ravel(), (0, t[-1]), np.zeros(shape[0] * r), method="DOP853",
-            t_eval=t, rtol=1e-9, atol=1e-11, max_step=1 / RATE,
+            t_eval=t, rtol=1e-9, atol=1e-11, max_step=1 / rate,
         )  # fmt: skip
         accelerations = [slope(y.reshape(shape), now)[n : 2 * n].T for y, now in zip(motion.y.T, bases.T, strict=True)]
         relative = np.stack(accelerations, axis=-1)
@@ -120,16 +120,18 @@ def storeys(kind: Kind, rng: np.random.Generator, n: int) -> Storeys:
     return replace(linear, size=sizes.get(kind, 0.7 * drift))
 
 
-def shaken(level: float, seconds: float, rng: np.random.Generator) -> Array:
+def shaken(level: float, seconds: float, rng: np.random.Generator, rate: float = RATE) -> Array:
     """A random base acceleration in the band, of an rms level, m/s², that begins and ends softly."""
-    samples = int(seconds * RATE)
-    spectrum, freq = np.fft.rfft(rng.standard_normal(samples)), np.fft.rfftfreq(samples, 1 / RATE)
+    samples = int(seconds * rate)
+    spectrum, freq = np.fft.rfft(rng.standard_normal(samples)), np.fft.rfftfreq(samples, 1 / rate)
     spectrum[(freq < BAND[0]) | (freq > BAND[1])] = 0.0
-    base, t = np.fft.irfft(spectrum, samples), np.arange(samples) / RATE
+    base, t = np.fft.irfft(spectrum, samples), np.arange(samples) / rate
     return level * base / base.std() * np.clip(np.minimum(t, t[-1] - t) / 2, 0.0, 1.0)
 
 
-def recorded(runs: list[tuple[Array, Array]], noise: float, rng: np.random.Generator) -> sysid.Measurement:
+def recorded(
+    runs: list[tuple[Array, Array]], noise: float, rng: np.random.Generator, rate: float = RATE
+) -> sysid.Measurement:
     """The test of some runs of base and response, with noise of this share of each channel's rms."""
 
     def noisy(x: Array) -> Array:
@@ -137,7 +139,7 @@ def recorded(runs: list[tuple[Array, Array]], noise: float, rng: np.random.Gener
 
     n = len(runs[0][1])
     return sysid.Measurement.from_time(
-        [(noisy(base[None]), noisy(response), None) for base, response in runs], RATE,
+        [(noisy(base[None]), noisy(response), None) for base, response in runs], rate,
         rigid_body=np.ones((n, 1)), band=BAND,
         sensors=[sysid.Sensor(f"floor {i + 1}", (0.0, 0.0, float(i)), "x") for i in range(n)],
     )  # fmt: skip

@@ -12,7 +12,7 @@ from benchmarks.amplitude.softening_storeys import LEVELS, recorded, shaken, sto
 from benchmarks.line import Line, above
 from sysid.errors import Stop
 from sysid.modal_analysis.amplitude_fit import with_laws
-from sysid.modal_analysis.fit import fit_modes, left_of
+from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -31,7 +31,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         steps += 1
 
     begun = time.perf_counter()
-    with_laws(linear, asked, left_of, monitor=FitMonitor(counted))
+    with_laws(linear, asked, monitor=FitMonitor(counted))
     whole, wrong = time.perf_counter() - begun, set()
     ends = [KeyboardInterrupt if i % 2 == 0 else Stop for i in range(2 if reduced else 20)]
     good = 0
@@ -43,7 +43,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             if left[0] <= 0:
                 raise end("stopped")
 
-        found = with_laws(linear, asked, left_of, monitor=FitMonitor(stop))
+        found = with_laws(linear, asked, monitor=FitMonitor(stop))
         laws = found.parameters.laws
         faults = {
             "not told": not found.stopped,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.misfit import at_lines, left_of
 from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
 from sysid.modal_analysis.record_fit import (
@@ -27,22 +28,22 @@ from sysid.modal_analysis.record_fit import (
 )
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 
 def with_laws(
-    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], *, monitor: FitMonitor,
-    much: float = 0.1, tries: tuple[float, ...] = (0.0, 0.03),
+    fit: RecordFit, stated: AmplitudeLaw, *, monitor: FitMonitor, much: float = 0.1,
+    tries: tuple[float, ...] = (0.0, 0.03), probe: bool = False,
 ) -> RecordFit:  # fmt: skip
     """The fit with laws of the stated modes, numbered from 1 by frequency within the lines; `left_out` are the others.
 
     Laws come mode by mode, each of exponents of its own. One that the likelihood takes stands in the fit as the next is
     tried; one that it does not is left out of it. "auto" goes on from the first mode where that has a law.
 
-    Where the linear model misses `much`, by what `left_of` gives, what it misses passes for noise of the base, which
+    Where the linear model misses `much`, what it misses passes for noise of the base, which
     then explains any law: squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these
-    falls of the frequency at the highest level.
+    falls of the frequency at the highest level. A `probe` ends where the first law leaves as much.
 
     Raises
     ------
@@ -53,17 +54,18 @@ def with_laws(
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            for stage in _stages(fit, stated, left_of, monitor, much, tries):
+            for stage in _stages(fit, stated, monitor, much, tries):
                 best = stage
+                if probe and left_of(stage) > much:
+                    break
     except (Stop, KeyboardInterrupt):
         return replace(best, stopped=True)
     return best
 
 
 def _stages(
-    fit: RecordFit, stated: AmplitudeLaw, left_of: Callable[[RecordFit], float], monitor: FitMonitor, much: float,
-    tries: tuple[float, ...],
-) -> Iterator[RecordFit]:  # fmt: skip
+    fit: RecordFit, stated: AmplitudeLaw, monitor: FitMonitor, much: float, tries: tuple[float, ...]
+) -> Iterator[RecordFit]:
     """The fit with laws that are likelier than none, from stage to stage; the fit itself as long as there are none."""
     whole = fit.model.whole
     plain = left_of(fit) > much or whole.plain
@@ -101,9 +103,11 @@ def _stages(
             monitor.doing = "noise of all channels"
             noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
             best, linear = (
-                refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, monitor=monitor)
-                for p in (_with_equivalents(best), linear.parameters)
+                refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, limits=limits, monitor=monitor)
+                for p, limits in ((_with_equivalents(best), WHOLE), (linear.parameters, TRIAL))
             )
+            if not fit.model.whole.plain:  # what it explains by noise of the base may have taken many steps
+                linear = max(linear, fit, key=lambda one: one.likelihood)
     if plain or len(best.parameters.laws) > 1:
         best, gone = _holding(best, linear, TRIAL if best.model.whole.plain else WHOLE, monitor)
         left_out += gone
@@ -178,8 +182,8 @@ def _without(fit: RecordFit, number: int, limits: Limits, monitor: FitMonitor) -
     by = np.where(followed, law.equivalent.mean(axis=0)[:, None], 1.0)
     modes = p.modes._replace(omega=p.modes.omega * by[0], ratios=p.modes.ratios * by[1])
     ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode without a law they are no state
-    begun = replace(p, modes=modes, ends=ends, laws=tuple(one for one in p.laws if one is not law))
-    return refitted(fit, begun, limits=limits, monitor=monitor)
+    p = replace(p, modes=modes, ends=ends, laws=tuple(one for one in p.laws if one is not law))
+    return refitted(fit, p, limits=limits, monitor=monitor)
 
 
 def _of_lines(fit: RecordFit) -> Array:
@@ -289,17 +293,8 @@ def _with_exponent(fit: RecordFit, number: int, exponent: float) -> Parameters:
 
 def _shared(fit: RecordFit) -> float:
     """Factor of variances for what a fit leaves beyond its noise, and what neighbouring lines of it share."""
-    return max(fit.reduced, 1.0) * line_correlation(_white_errors(fit), fit.model.unknowns)
-
-
-def _white_errors(fit: RecordFit) -> ComplexArray:
-    """What the fit leaves of each output in units of its noise, (channels, runs, n_freq)."""
-    test, model = fit.test, fit.model
-    left = np.zeros((model.channels, test.n_runs, test.freq.size), complex)
-    for chunk in model.chunks(fit.parameters):
-        at = chunk.run.among(test.freq)
-        left[:, chunk.run.number, at] = chunk.deviations(fit.levels)[0] * chunk.error
-    return left
+    white = at_lines(fit, lambda chunk: chunk.deviations(fit.levels)[0] * chunk.error)
+    return max(fit.reduced, 1.0) * line_correlation(white.swapaxes(0, 1), fit.model.unknowns)
 
 
 def _with_equivalents(fit: RecordFit) -> Parameters:
@@ -352,11 +347,7 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         poles = model.index.log_omega.start, model.index.log_ratios.start
         at = [*(start + law.mode for start in poles), *range(first, first + law.form.size)]
         first += law.form.size
-        omega, ratio = float(p.modes.omega[law.mode]), float(p.modes.ratios[law.mode])
-        found.append(
-            FittedLaw(
-                omega / (2 * np.pi), ratio, law.sensor, law.form, law.values, _levels(fit, law.mode, law.sensor),
-                covariance[np.ix_(at, at)], law.likelier,
-            )
-        )  # fmt: skip
+        pole = float(p.modes.omega[law.mode] / (2 * np.pi)), float(p.modes.ratios[law.mode])
+        levels, cov = _levels(fit, law.mode, law.sensor), covariance[np.ix_(at, at)]
+        found.append(FittedLaw(*pole, law.sensor, law.form, law.values, levels, cov, law.likelier))
     return tuple(found)

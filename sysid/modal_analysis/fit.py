@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.direct_terms import without_window
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
+from sysid.modal_analysis.misfit import deviations, left_of, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import (
@@ -58,7 +58,6 @@ from sysid.modal_analysis.residual_tests import (
     with_varying_levels,
 )
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import real_times
 from sysid.modal_analysis.rough_poles import (
     at_few_lines,
     at_sines_alone,
@@ -70,7 +69,7 @@ from sysid.modal_analysis.spectra_modes import strongest_poles
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
 from sysid.structure.amplitude import AmplitudeLaw
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array
 
 
 def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMonitor | None = None) -> RecordFit:
@@ -141,16 +140,6 @@ def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
     return [refitted(anew, anew.parameters, monitor=monitor)]
 
 
-def left_of(fit: RecordFit) -> float:
-    """What a fit leaves of the accelerations against the base, over these: a rigid body leaves one."""
-    left = size = 0.0
-    for chunk in fit.model.chunks(fit.parameters):
-        moved = chunk.run.outputs[: fit.model.n] - real_times(fit.test.rigid_body, chunk.run.base)
-        left += float(np.sum(np.abs(chunk.error[: fit.model.n]) ** 2))
-        size += float(np.sum(np.abs(moved) ** 2))
-    return float(np.sqrt(left / size)) if size else 0.0
-
-
 def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
     """Refuse modes of records of a steady sine where no other line shows them."""
     sentence, modes = steady_sine(test), fit.parameters.modes
@@ -219,14 +208,23 @@ def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
         fit = on_all_lines(fit, test, monitor=monitor)
         monitor.keep(fit)
         return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
-    monitor.doing = "poles by rough weights"
-    poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
-    fit = _fitted(test, poles, monitor)
+    fit = _fitted(_rough_fit(test, monitor), monitor)
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):
-        fit = max(fit, _fitted(test, again, monitor, beside=fit), key=lambda one: one.schwarz)
+        fit = max(fit, _fitted(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
     return _with_all_modes(fit, monitor)
+
+
+def _rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+    monitor.doing = "poles by rough weights"
+    return _with_poles(test, find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor), monitor)
+
+
+def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
+    """One mode at each pole, roughly, without those that noise explains; further ones at a pole show in its errors."""
+    monitor.doing = f"{poles.omega.size} modes"
+    return _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
 
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
@@ -243,16 +241,14 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | Non
     return fit
 
 
-def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
-    """One mode at each pole, settled, without those that noise explains; further ones at a pole show in its errors.
+def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
+    """The fit, settled, without modes that noise explains.
 
     Where a few steps lead to the modes of the fit `beside` within the lines, and to as many, it is the same: poles
     beyond the lines, which hardly show, move until the end.
     """
-    monitor.doing = f"{poles.omega.size} modes"
-    fit = _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
     if beside is not None and beside.settled and beside.model.m == fit.model.m and beside.schwarz >= fit.schwarz:
-        last = 2 * np.pi * test.freq[-1]
+        last = 2 * np.pi * fit.test.freq[-1]
         if _same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
             return beside
     fit = _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
@@ -290,33 +286,9 @@ def _least(fit: RecordFit) -> NDArray[np.bool_]:
     return gone
 
 
-def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
-    """Standard deviations ``sqrt(E|e|²)`` of responses and force at each line: their own noise and the base's."""
-    test, model = fit.test, fit.model
-    parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
-    c = model.channels
-    for chunk in model.chunks(fit.parameters):
-        variances = chunk.run.variances(fit.levels)
-        parts[chunk.run.number].append(np.sqrt(variances[:c] + np.sum(np.abs(chunk.H) ** 2 * variances[c:], axis=1)))
-    std = _at_lines(test, parts)
-    for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
-        run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
-    n = test.n_sensors
-    return std[:, :n], std[:, n:] if model.force else None
-
-
-def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any]:
-    """Chunks of each run's own lines as (runs, channels, n_freq), zero at the lines of others."""
-    joined = [np.concatenate(run, axis=1) for run in parts]
-    out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
-    for at, lines, run in zip(out, test.own_lines, joined, strict=True):
-        at[:, lines] = run
-    return out
-
-
 def fit_modes(
     test: Measurement, delays: Delays | None = None, calibration: Calibration | None = None, *,
-    monitor: FitMonitor | None = None,
+    monitor: FitMonitor | None = None, amplitude: AmplitudeLaw | None = None,
 ) -> ModalEstimate:  # fmt: skip
     """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
@@ -328,6 +300,8 @@ def fit_modes(
     calibration : Calibration, optional
         Errors of its gains, which are taken off; by default what is stated of them alone.
     monitor : FitMonitor, optional
+    amplitude : AmplitudeLaw, optional
+        Laws that modes of whole records may follow: see `with_laws`.
 
     Raises
     ------
@@ -339,9 +313,13 @@ def fit_modes(
     if test.whole is None:
         return _of_lines(test, delays, calibration, monitor)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        fit = whole_fit(test, values, monitor=monitor)
+        of_laws = monitor or FitMonitor()
+        early = amplitude and _early_laws(test, values, amplitude, of_laws)
+        fit = early or whole_fit(test, values, monitor=monitor)
         if calibration is not None and not (fit.stopped or np.any(calibration.values)):
             fit, calibration = _calibrated(fit, calibration, monitor)
+        if amplitude is not None and early is None:
+            fit = with_laws(fit, amplitude, monitor=of_laws)
         return estimate(fit, calibration)
 
 
@@ -405,8 +383,10 @@ def of_calibrated_lines(modal: ModalEstimate, calibration: Calibration) -> Modal
     return replace(turned, delays=modal.delays, calibration=calibration)
 
 
-def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
-    """The modes of each test without its delays; they share the time of the monitor.
+def fit_tests(
+    tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMonitor, amplitude: AmplitudeLaw | None = None
+) -> tuple[ModalEstimate, ...]:
+    """The modes of each test without its delays; they share the time of the monitor. The first may have laws.
 
     Raises
     ------
@@ -417,7 +397,8 @@ def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMo
     for number, (test, delays) in enumerate(every, start=1):
         monitor.begin(sum(one.whole is not None for one, _ in every[number - 1 :]))
         try:
-            found.append(fit_modes(test, delays, monitor=monitor))
+            found.append(fit_modes(test, delays, monitor=monitor, amplitude=amplitude))
+            amplitude = None
         except (Stop, KeyboardInterrupt) as stop:
             if len(every) == 1:
                 raise
@@ -426,40 +407,35 @@ def fit_tests(tests: Iterable[tuple[Measurement, Delays | None]], monitor: FitMo
     return tuple(found)
 
 
-def follow_amplitude(modal: ModalEstimate, stated: AmplitudeLaw | None, monitor: FitMonitor) -> ModalEstimate:
-    """The estimate of whole records with laws of the stated modes; itself where none are asked for.
+def _early_laws(
+    test: Measurement, delays: Array | None, stated: AmplitudeLaw, monitor: FitMonitor, much: float = 0.1
+) -> RecordFit | None:
+    """The fit with laws from rough poles, where these explain what the linear model misses; else None.
 
-    Raises
-    ------
-    InputError
-        Where there is no such mode.
+    What it misses passes for noise of the base, modes and dampers, which take long and mean nothing. The numbers of
+    stated modes, but for the first, are those of the whole linear fit.
     """
-    fit = modal.record_fit
-    if stated is None or fit is None:
-        return modal
-    monitor.begin(1)
-    with one_thread():
-        found = with_laws(fit, stated, left_of, monitor=monitor)
-    if found.parameters.laws or found.stopped:
-        return estimate(found, modal.calibration)
-    return replace(modal, record_fit=found, laws=found.left_out)
-
-
-def without_transients(fit: RecordFit) -> Measurement:
-    """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
-    test, model, p = fit.test, fit.model, fit.parameters
-    free: list[list[ComplexArray]] = [[] for _ in range(test.n_runs)]
-    for chunk in model.chunks(p):
-        at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
-        predicted = np.einsum("cdl,dl->cl", at_rest.H, chunk.run.base)
-        free[chunk.run.number].append(chunk.run.outputs - chunk.error - predicted)
-    taken = _at_lines(test, free)
-    n = test.n_sensors
-    std, force_std = deviations(fit)
-    return replace(
-        test, whole=None, response=test.response - taken[:, :n], response_std=std,
-        force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
-    )  # fmt: skip
+    test = test if delays is None else without_delays(test, delays)
+    if stated.modes not in ("auto", (1,)) or steady_sine(test) is not None:
+        return None
+    try:
+        with monitor.at_work():
+            rough = at_all_lines(_rough_fit(test.at(decimated_lines(test)), monitor), test)
+    except (InputError, np.linalg.LinAlgError):  # told by the whole fit
+        return None
+    if left_of(rough) < much:
+        return None
+    found = with_laws(rough, stated, monitor=monitor, probe=True)
+    if found.stopped:
+        return found
+    if not found.parameters.laws or found.model.whole.plain:
+        return None
+    try:
+        with monitor.at_work():
+            more = _pruned(with_further_modes(found, monitor=monitor), monitor)
+    except (Stop, KeyboardInterrupt):
+        return replace(found, stopped=True)
+    return replace(more, left_out=found.left_out)
 
 
 @one_thread()

@@ -7,8 +7,9 @@ linear mode and what the law adds, and so is every derivative.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,36 +23,11 @@ from sysid.structure.amplitude import motion
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 
-@dataclass(frozen=True, eq=False)
-class Addition:
-    """What a law adds to the motion of its linear mode at the lines of a run, and derivatives of it.
-
-    Attributes
-    ----------
-    motion : (L,)
-    by_ends : (2, L)
-    by_gamma : (d, L)
-    by_omega, by_ratio, by_size : (L,)
-        By logarithms.
-    by_law : (k, L)
-    """
-
-    motion: ComplexArray
-    by_ends: ComplexArray
-    by_gamma: ComplexArray
-    by_omega: ComplexArray
-    by_ratio: ComplexArray
-    by_size: ComplexArray
-    by_law: ComplexArray
-
-    def at(self, lines: NDArray[np.intp]) -> Addition:
-        """Some of its lines."""
-        return Addition(*(part[..., lines] for part in vars(self).values()))
-
-
 class LawMotions:
     """Motions of the modes that follow a law, of all runs of a test, and what they add to the linear ones.
 
+    An addition, (6 + d + k, L), is that to the motion at the lines of a run, and its derivatives by two ends, d
+    participations, the logarithms of frequency, damping ratio and size of the shape, and the k numbers of the law.
     Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for.
     """
 
@@ -60,8 +36,8 @@ class LawMotions:
         self.rate, self.samples, self.at_rest = _clock_of(test)
         self.lines = [test.freq[lines] for lines in test.own_lines]
         self.base = [base[:, lines] for base, lines in zip(test.base, test.own_lines, strict=True)]
-        self._series: dict[tuple[int, int], tuple[int, Array]] = {}
-        self._last: dict[tuple[int, int], tuple[Array, Addition]] = {}
+        self._steps: dict[int, int] = {}
+        self._series, self._last = _motions_of(test)
 
     def places(self, run: int) -> NDArray[np.intp]:
         """Numbers of the lines of a run among all of its Fourier transform."""
@@ -69,32 +45,32 @@ class LawMotions:
 
     def in_time(self, run: int, mode: int, omega: float) -> tuple[int, Array]:
         """Motion of the base (d, n) whose straight lines from step to step have the run's lines; steps a sample."""
-        if (run, mode) not in self._series:
-            times = int(np.ceil(self.per_period * omega / (2 * np.pi) / self.rate))
+        times = self._steps.setdefault(mode, int(np.ceil(self.per_period * omega / (2 * np.pi) / self.rate)))
+        if (run, times) not in self._series:
             fine = self.samples[run] * times
             spectrum = np.zeros((len(self.base[run]), fine // 2 + 1), complex)
             straight = np.sinc(self.lines[run] / (self.rate * times)) ** 2
             spectrum[:, self.places(run)] = self.base[run] / straight * self.rate * times
-            self._series[run, mode] = times, np.fft.irfft(spectrum, fine)
-        return self._series[run, mode]
+            self._series[run, times] = np.fft.irfft(spectrum, fine)
+        return times, self._series[run, times]
 
-    def added(self, p: Parameters, run: Run, law: int) -> Addition:
+    def added(self, p: Parameters, run: Run, law: int) -> ComplexArray:
         """What a law adds at the lines of a part of a run."""
-        return self.of_run(p, run.number, law).at(run.among(self.lines[run.number]))
+        return self.of_run(p, run.number, law)[:, run.among(self.lines[run.number])]
 
-    def of_run(self, p: Parameters, run: int, law: int) -> Addition:
+    def of_run(self, p: Parameters, run: int, law: int) -> ComplexArray:
         """What a law adds at all lines of a run; that of the last numbers of it is kept."""
         one, modes = p.laws[law], p.modes
         k, size = one.mode, modes.phi[one.sensor, one.mode]
-        beside = [k, *one.form, modes.omega[k], modes.ratios[k], size]
+        times, series = self.in_time(run, k, float(modes.omega[k]))
+        beside = [k, times, *one.form, modes.omega[k], modes.ratios[k], size]
         numbers = np.concatenate([modes.gamma[k], p.ends[k], one.values, one.equivalent[run], beside])
         if (run, law) not in self._last or not np.array_equal(self._last[run, law][0], numbers):
-            self._last[run, law] = numbers, self._added(p, run, one)
+            self._last[run, law] = numbers, self._added(p, run, one, times, series)
         return self._last[run, law][1]
 
-    def _added(self, p: Parameters, run: int, law: ModeLaw) -> Addition:
+    def _added(self, p: Parameters, run: int, law: ModeLaw, times: int, series: Array) -> ComplexArray:
         modes, k = p.modes, law.mode
-        times, series = self.in_time(run, k, float(modes.omega[k]))
         d, rest = len(series), self.at_rest[run]
         first = 2 * sum(not one for one in self.at_rest[:run])
         ends = np.zeros(2) if rest else p.ends[k, first : first + 2]
@@ -108,12 +84,18 @@ class LawMotions:
         g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], *pole)
         transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
         load = gamma @ base + ends @ transients
-        here = spectra[0] - gamma @ base
-        by_ends = np.zeros((2, w.size)) if rest else spectra[[2, 1]]
-        return Addition(
-            here - g[0] * load, by_ends - g[0] * transients, spectra[3 : 3 + d] - base - g[0] * base,
-            spectra[3 + d] - by_omega * load, spectra[4 + d] - by_ratio * load, spectra[5 + d], spectra[6 + d :],
-        )  # fmt: skip
+        spectra[1:3] = np.zeros((2, w.size)) if rest else spectra[[2, 1]]
+        linear = [gamma @ base + g[0] * load, *g[0] * transients, *base + g[0] * base, by_omega * load, by_ratio * load]
+        spectra[: 5 + d] -= linear
+        return np.asarray(spectra)
+
+
+@functools.lru_cache(maxsize=1)
+def _motions_of(
+    test: Measurement,
+) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int], tuple[Array, ComplexArray]]]:
+    """Motions of the base in time, by run and steps a sample, and last additions, by run and law: of all models."""
+    return {}, {}
 
 
 def linear_modes(p: Parameters, run: int) -> Modes:
@@ -126,7 +108,7 @@ def linear_modes(p: Parameters, run: int) -> Modes:
 
 
 def add_laws(
-    plain: ComplexArray, laws: Sequence[ModeLaw], additions: Sequence[Addition], shape: tuple[int, ...], *, ends: bool
+    plain: ComplexArray, laws: Sequence[ModeLaw], added: Sequence[ComplexArray], shape: tuple[int, ...], *, ends: bool
 ) -> list[ComplexArray]:
     """Add what laws add to the spectra of the linear modes, in place; give derivatives by size and law, law by law.
 
@@ -135,15 +117,15 @@ def add_laws(
     m, d = shape
     first = np.cumsum([0, m, m * d, m, m, d])  # of motions, by gamma, by log omega, by log zeta; of the base, of ends
     beside = []
-    for law, added in zip(laws, additions, strict=True):
+    for law, one in zip(laws, added, strict=True):
         k = law.mode
-        plain[k] += added.motion
-        plain[first[1] + k * d : first[1] + (k + 1) * d] += added.by_gamma
-        plain[first[2] + k] += added.by_omega
-        plain[first[3] + k] += added.by_ratio
+        plain[k] += one[0]
+        plain[first[1] + k * d : first[1] + (k + 1) * d] += one[3 : 3 + d]
+        plain[first[2] + k] += one[3 + d]
+        plain[first[3] + k] += one[4 + d]
         if ends:
-            plain[first[5] + 2 * k : first[5] + 2 * k + 2] += added.by_ends
-        beside += [added.by_size[None], added.by_law]
+            plain[first[5] + 2 * k : first[5] + 2 * k + 2] += one[1:3]
+        beside.append(one[5 + d :])
     return beside
 
 
@@ -194,7 +176,7 @@ def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray
     p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)
     for run, lines in enumerate(test.own_lines):
         for number, law in enumerate(laws):
-            added = motions.of_run(p, run, number).motion
+            added = motions.of_run(p, run, number)[0]
             response[run][:, lines] += modes.phi[:, [law.mode]] * added
             force[run][:, lines] += modes.gamma[law.mode][:, None] * added
     return response, force

@@ -1,9 +1,10 @@
-"""Noise and misfit of the records of a test: what a structure leaves of them, and their stated or inferred noise."""
+"""Noise and misfit of the records of a test: what a structure or a fit leaves of them, stated or inferred noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import products
 from sysid.modal_analysis.law_spectra import without_laws
+from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_model import Chunk
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, stacked, weights_of_numbers
+from sysid.modal_analysis.response import columns, real_times, stacked, weights_of_numbers
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import EPSILON, beyond_chance
 
@@ -159,3 +162,55 @@ def _fitted(left: ComplexArray, transients: ComplexArray, traces: ComplexArray) 
     explained = rows @ x
     explained = (explained + (wanted - explained) @ Q @ Q.T) * size[:, None]
     return explained[:, :lines] + 1j * explained[:, lines:]
+
+
+def left_of(fit: RecordFit) -> float:
+    """What a fit leaves of the accelerations against the base, over these: a rigid body leaves one."""
+    left = size = 0.0
+    for chunk in fit.model.chunks(fit.parameters):
+        moved = chunk.run.outputs[: fit.model.n] - real_times(fit.test.rigid_body, chunk.run.base)
+        left += float(np.sum(np.abs(chunk.error[: fit.model.n]) ** 2))
+        size += float(np.sum(np.abs(moved) ** 2))
+    return float(np.sqrt(left / size)) if size else 0.0
+
+
+def without_transients(fit: RecordFit) -> Measurement:
+    """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
+    test, model, p, n = fit.test, fit.model, fit.parameters, fit.test.n_sensors
+
+    def transients(chunk: Chunk) -> ComplexArray:
+        at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
+        return np.asarray(chunk.run.outputs - chunk.error - np.einsum("cdl,dl->cl", at_rest.H, chunk.run.base))
+
+    taken = at_lines(fit, transients)
+    std, force_std = deviations(fit)
+    return replace(
+        test, whole=None, response=test.response - taken[:, :n], response_std=std,
+        force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
+    )  # fmt: skip
+
+
+def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
+    """Standard deviations ``sqrt(E|e|²)`` of responses and force at each line: their own noise and the base's."""
+    test, c, n = fit.test, fit.model.channels, fit.test.n_sensors
+
+    def noise(chunk: Chunk) -> Array:
+        variances = chunk.run.variances(fit.levels)
+        return np.sqrt(variances[:c] + np.sum(np.abs(chunk.H) ** 2 * variances[c:], axis=1))
+
+    std = at_lines(fit, noise)
+    for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
+        run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
+    return std[:, :n], std[:, n:] if fit.model.force else None
+
+
+def at_lines(fit: RecordFit, values: Callable[[Chunk], NDArray[Any]]) -> NDArray[Any]:
+    """What is found in parts of each run's own lines, as (runs, channels, n_freq), zero at the lines of others."""
+    test, parts = fit.test, [list[NDArray[Any]]() for _ in range(fit.test.n_runs)]
+    for chunk in fit.model.chunks(fit.parameters):
+        parts[chunk.run.number].append(values(chunk))
+    joined = [np.concatenate(run, axis=1) for run in parts]
+    out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
+    for at, lines, run in zip(out, test.own_lines, joined, strict=True):
+        at[:, lines] = run
+    return out

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.gains import read_by_gains
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.law_spectra import Addition, LawMotions, add_laws, law_entries, linear_modes
+from sysid.modal_analysis.law_spectra import LawMotions, add_laws, law_entries, linear_modes
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
     FAR,
@@ -389,7 +389,7 @@ class LawChunk(Chunk):
         return linear_modes(p, run.number)
 
     @cached_property
-    def added(self) -> list[Addition]:
+    def added(self) -> list[ComplexArray]:
         """What each law adds."""
         motions = self.records.law_motions
         return [] if motions is None else [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
@@ -398,7 +398,7 @@ class LawChunk(Chunk):
         """See `Lines`."""
         motion = super().motion_of(base)
         for law, added in zip(self.p.laws, self.added, strict=True):
-            motion[law.mode] += added.motion
+            motion[law.mode] += added[0]
         return motion
 
     def spectra(self, base: ComplexArray) -> ComplexArray:

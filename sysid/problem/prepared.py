@@ -18,7 +18,7 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Clock, Delays, stored_delays
-from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests, follow_amplitude
+from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
@@ -205,14 +205,12 @@ class Prepared(SearchSpace):
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
-        first, *further = (
-            fit_modes(test, delays, calibration) if fit is None else estimate(fit, calibration)
-            for test, delays, calibration, fit in zip(
-                self.stated.tests, self.delays, self._calibrations, self._fits, strict=True
-            )
+        laws = [self.stated.amplitude, *[None] * (len(self._fits) - 1)]
+        given = zip(self.stated.tests, self.delays, self._calibrations, self._fits, laws, strict=True)
+        return tuple(  # a stored fit has its laws
+            fit_modes(test, delays, calibration, amplitude=law) if fit is None else estimate(fit, calibration)
+            for test, delays, calibration, fit, law in given
         )
-        asked = self.stated.amplitude if self._fits[0] is None else None  # a stored fit has its laws
-        return (follow_amplitude(first, asked, FitMonitor()), *further)
 
     def fit_lines(
         self, poles: Poles, count: int | None, monitor: IterationMonitor, max_iterations: int
@@ -250,8 +248,7 @@ class Prepared(SearchSpace):
 
     def fit_modes(self, monitor: FitMonitor) -> None:
         """Fit the modes of each test, and the laws that are asked for to the problem's own whole records."""
-        first, *further = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor)
-        self.modal = (follow_amplitude(first, self.stated.amplitude, monitor), *further)
+        self.modal = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor, self.stated.amplitude)
 
     @property
     def laws(self) -> tuple[FittedLaw, ...]:

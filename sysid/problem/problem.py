@@ -110,7 +110,7 @@ class Problem(StatedProblem, SearchSpace):
             goal=tree["goal"],
             loss=tree["loss"],
             residual_modes=tree.get("residual_modes", False),  # results of before have none
-            amplitude=tree.get("amplitude") and AmplitudeLaw.from_tree(tree["amplitude"]),
+            amplitude=tree.get("amplitude") and AmplitudeLaw(**tree["amplitude"]),
         )
         vars(problem)["prepared"] = Prepared.from_tree(problem, tree)
         if tree["poles"] is not None:

@@ -59,29 +59,14 @@ class AmplitudeLaw:
         if isinstance(self.exponents, str) and self.exponents == "auto":
             return
         sound = isinstance(self.exponents, list | tuple) and len(self.exponents) == 2
-        sound = sound and all(isinstance(one, int | float) for one in self.exponents)
         sound = sound and self.exponents[0] in OF_FREQUENCY and self.exponents[1] in OF_DAMPING
-        if not sound:
-            raise InputError(
-                f"AmplitudeLaw: exponents = {self.exponents!r}; give 'auto', or one of {OF_FREQUENCY} for the "
-                f"frequency and one of {OF_DAMPING} for the damping"
-            )
+        each = f"one of {OF_FREQUENCY} for the frequency and one of {OF_DAMPING} for the damping"
+        refuse((not sound, f"AmplitudeLaw: exponents = {self.exponents!r}; give 'auto', or {each}"))
         object.__setattr__(self, "exponents", (float(self.exponents[0]), float(self.exponents[1])))
 
     def to_tree(self) -> dict[str, Any]:
-        """Give the fields; `from_tree` takes them back."""
-        return {
-            "modes": None if self.modes == "auto" else np.array(self.modes),
-            "exponents": None if self.exponents == "auto" else np.array(self.exponents),
-        }
-
-    @classmethod
-    def from_tree(cls, tree: dict[str, Any]) -> AmplitudeLaw:
-        """What a tree of `to_tree` stands for."""
-        modes, exponents = tree["modes"], tree["exponents"]
-        return cls(
-            "auto" if modes is None else modes.tolist(), "auto" if exponents is None else tuple(exponents.tolist())
-        )
+        """Give the arguments of the constructor."""
+        return {name: value if value == "auto" else list(value) for name, value in vars(self).items()}
 
 
 class LawForm(NamedTuple):
@@ -155,13 +140,7 @@ class FittedLaw:
         return self.likelier and away > beyond_chance(self.values.size)
 
     def among(self, frequencies: Array, within: float = 0.1) -> FittedLaw:
-        """The law of the nearest mode of a structure, Hz, `within` this share of its frequency.
-
-        Raises
-        ------
-        InputError
-            Where none is so near.
-        """
+        """The law of the nearest mode of a structure, Hz; an `InputError` where none is `within` this share of it."""
         apart = np.abs(frequencies / self.frequency - 1)
         k = int(np.argmin(apart))
         if apart[k] > within:
@@ -185,11 +164,7 @@ class FittedLaw:
     def change(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Relative change of the frequency, and change of the damping ratio, over the levels, with their deviations."""
         low, high = self.levels
-
-        def of_levels(at: Callable[[float], tuple[ca.SX, ca.SX]]) -> ca.SX:
-            return ca.vertcat(at(high)[0] / at(low)[0] - 1, at(high)[1] - at(low)[1])
-
-        return self._with_deviations(of_levels)
+        return self._with_deviations(lambda at: ca.vertcat(at(high)[0] / at(low)[0] - 1, at(high)[1] - at(low)[1]))
 
     def deviations_at(self, level: float) -> tuple[float, float]:
         """Standard deviations of both, to first order."""

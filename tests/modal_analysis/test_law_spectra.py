@@ -22,7 +22,7 @@ from sysid.modal_analysis.amplitude_fit import (
     fitted_laws,
     with_laws,
 )
-from sysid.modal_analysis.fit import fit_modes, follow_amplitude, left_of
+from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
@@ -175,7 +175,7 @@ def test_a_mode_that_shows_at_several_levels_has_one_law(test):
     """As the linear fit of a long test of levels 1:10 has three poles of one mode."""
     fit = record_modes(test, OMEGA[[0, 0, 0, 1]] * [0.93, 0.96, 1.0, 1.0], RATIOS[[0, 0, 0, 1]])
     assert fit.model.m == 4
-    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), monitor=FitMonitor())
     (law,) = fitted_laws(found)
     assert found.model.m == 2  # and so two sensors have as many modes as there are
     scale = LEVEL / law.form.level
@@ -191,7 +191,7 @@ def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
     added = 0.3 * w**2 / (beside**2 - w**2 + 0.04j * beside * w) * test.base
     both = replace(test, response=test.response + PHI[:, :1] * added)
     fit = record_modes(both, np.append(OMEGA, beside), np.append(RATIOS, 0.02))
-    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=FitMonitor())
+    found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), monitor=FitMonitor())
     assert np.sort(found.parameters.modes.omega) / (2 * np.pi) == pytest.approx([3.0, 3.3, 8.0], rel=1e-3)
     assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0], rel=1e-3)
 
@@ -199,7 +199,7 @@ def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
 def test_a_law_is_judged_against_the_fit_without_it_alone(test):
     """The first mode has a law, which gains enough for two; a law of the second, linear one is left out beside it."""
     monitor, linear = FitMonitor(), fit_modes(test).record_fit
-    true = with_laws(linear, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), left_of, monitor=monitor)
+    true = with_laws(linear, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), monitor=monitor)
     second = int(np.argmax(true.parameters.modes.omega))
     both = _started(true, second, (0.5, 1.0), (0.0,), WHOLE, monitor)
     held, gone = _holding(both, linear, WHOLE, monitor)
@@ -305,7 +305,7 @@ def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, number, e
 
 
 def test_a_fit_that_is_stopped_keeps_the_best_so_far(test):
-    fit = fit_modes(test)
+    fit = fit_modes(test).record_fit
     most = []
     for after in (0, 3, 9, 27):
         calls = []
@@ -316,11 +316,29 @@ def test_a_fit_that_is_stopped_keeps_the_best_so_far(test):
                 raise KeyboardInterrupt
 
         monitor = FitMonitor(stop)
-        found = follow_amplitude(fit, sysid.AmplitudeLaw(exponents=(0.5, 1.0)), monitor)
-        assert found.record_fit.stopped
-        most.append(found.record_fit.likelihood)
+        found = with_laws(fit, sysid.AmplitudeLaw(exponents=(0.5, 1.0)), monitor=monitor)
+        assert found.stopped
+        most.append(found.likelihood)
     assert most == sorted(most)
-    assert most[0] == pytest.approx(fit.record_fit.likelihood)
+    assert most[0] == pytest.approx(fit.likelihood)
+
+
+def test_a_law_that_explains_the_records_is_found_before_the_linear_fit_ends(monkeypatch):
+    """A weak third mode is found beside it; where no law does, the whole linear fit stands."""
+    asked = sysid.AmplitudeLaw(exponents=(0.5, 1.0))
+
+    def whole(*_, **__):
+        raise AssertionError("the whole linear fit")
+
+    test = test_of((0.3, 3.0))
+    w, weak = 2 * np.pi * test.freq, 2 * np.pi * 5.5
+    added = 0.005 * w**2 / (weak**2 - w**2 + 0.02j * weak * w) * test.base
+    monkeypatch.setattr("sysid.modal_analysis.fit.whole_fit", whole)
+    fit = fit_modes(replace(test, response=test.response + np.array([[1.0], [-0.3]]) * added), amplitude=asked)
+    assert fit.omega / (2 * np.pi) == pytest.approx([3.0, 5.5, 8.0], rel=3e-3)
+    assert [law.frequency for law in fit.laws if law.is_certain] == pytest.approx([3.0], rel=1e-3)
+    with pytest.raises(AssertionError, match="whole linear fit"):
+        fit_modes(test_of((0.3, 3.0), law=False), amplitude=asked)
 
 
 def test_a_linear_structure_is_told_to_be_one():

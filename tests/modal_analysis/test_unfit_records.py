@@ -10,7 +10,8 @@ import pytest
 import sysid
 from benchmarks.channels.unfit import Case
 from benchmarks.records.simulated import four_storeys, with_noise
-from sysid.modal_analysis.fit import left_of, whole_fit
+from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.misfit import left_of
 from sysid.modal_analysis.noise_levels import bounded_by_lines
 from sysid.modal_analysis.record_fit import RecordFit, record_modes
 from sysid.modal_analysis.record_model import RecordModel

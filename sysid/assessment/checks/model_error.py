@@ -336,11 +336,8 @@ class ObservedPoles(NamedTuple):
         groups: list[list[int]] = []
         for k, omega in enumerate(self.omega):
             near = [group for group in groups if omega - self.omega[group[0]] < reach[[k, *group]].max()]
-            like = [
-                group
-                for group in near
-                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > _ONE_SHAPE
-            ]
+            one = [(self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > _ONE_SHAPE for group in near]
+            like = [group for group, same in zip(near, one, strict=True) if same and len(self.shapes) > 1]
             if like:
                 like[-1].append(k)
             else:
