@@ -112,8 +112,9 @@ class InTurn:
         after = self._after(chosen) or STRATEGIES[-1]()
         try:
             return self.run(after, f"{after.name!r}: the {chosen.name} one does not apply ({error})")
-        except InputError as other:
-            raise NoStrategyError(
+        except (InputError, SolverError) as other:
+            kind = NoStrategyError if isinstance(other, InputError) else SolverError
+            raise kind(
                 f"strategy {chosen.name!r} does not apply: {error}; nor does the {after.name}: {other}"
             ) from None
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import InputError, Problem, Swarm, identify
+from sysid import InputError, Problem, SolverError, Swarm, identify
 from sysid.search.strategy import DoesNotApplyError
 
 QUICK = Swarm(max_iterations=8, n_particles=20)
@@ -103,6 +103,15 @@ class TestAuto:
         with pytest.raises(InputError, match="modal is refused; nor does the swarm: swarm is refused") as caught:
             identify(problem, rng=0)
         assert not isinstance(caught.value, DoesNotApplyError)
+
+    def test_a_search_that_fails_after_one_that_does_not_apply_tells_why_it_was_tried(self, problem, monkeypatch):
+        def run(strategy, *_):
+            raise (SolverError if isinstance(strategy, Swarm) else DoesNotApplyError)(f"{strategy.name} is refused")
+
+        for kind in (sysid.Modal, sysid.Continuation, Swarm):
+            monkeypatch.setattr(kind, "run", run)
+        with pytest.raises(SolverError, match="modal is refused; nor does the swarm: swarm is refused"):
+            identify(problem, rng=0)
 
     @pytest.mark.parametrize("asked", ["modal", "swarm", sysid.Modal(), QUICK])
     def test_what_was_asked_is_said_to_be_so(self, problem, asked):
