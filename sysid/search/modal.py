@@ -270,17 +270,21 @@ def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
 
 
 def modal_structure(
-    problem: Prepared, options: Modal, monitor: IterationMonitor
+    problem: Prepared, options: Modal, monitor: IterationMonitor, poles: Poles | None = None
 ) -> tuple[Structure, ModalFit, DegreesOfFreedom, Poles]:
     """Structure that the data suggest without any search, and how it was fitted.
 
     With a lumped or known mass it is where the local phase in the unknowns starts; its modal masses come from the
     model. A `DoesNotApplyError` where a stated frequency is none of the data's, these do not suffice, or the modes are
-    too much alike at the sensors.
+    too much alike at the sensors. Those far above the lines are so where they stand for something else, as a gain.
     """
-    test, mass = problem.measurement, problem.formulation.mass
-    poles = poles_of(problem)
-    end = ended(problem, _estimated(problem, poles, options, monitor), monitor, options.max_iterations)
+    test, mass, poles = problem.measurement, problem.formulation.mass, poles or poles_of(problem)
+    try:
+        end = ended(problem, _estimated(problem, poles, options, monitor), monitor, options.max_iterations)
+    except SolverError as error:
+        if problem.modal[0].of_records or poles.omega[-1] <= 2 * np.pi * test.freq[-1]:
+            raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+        return modal_structure(problem, options, monitor, Poles(poles.omega[:-1], poles.ratios[:-1], poles.residual))
     # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
@@ -370,18 +374,14 @@ def held_to_totals(problem: Prepared, end: ModalFit, monitor: IterationMonitor, 
 def ended(problem: Prepared, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
     """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
 
-    The estimate itself where nobody wants to wait for it; a `DoesNotApplyError` where modes move so much alike that no
-    shapes can be told apart.
+    The estimate itself where nobody wants to wait for it; a `SolverError` where shapes cannot be told apart.
     """
     within = _within_bounds(problem, estimate)
     if monitor.is_over or monitor.stopped is not None:
         return estimate
-    try:
-        # Bounds that nothing presses on would cost iterations, as IPOPT begins away from them.
-        end = _again(problem, estimate, monitor, max_iterations, bounded=False) if within else estimate
-        return end if within and _within_bounds(problem, end) else _again(problem, end, monitor, max_iterations)
-    except SolverError as error:
-        raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+    # Bounds that nothing presses on would cost iterations, as IPOPT begins away from them.
+    end = _again(problem, estimate, monitor, max_iterations, bounded=False) if within else estimate
+    return end if within and _within_bounds(problem, end) else _again(problem, end, monitor, max_iterations)
 
 
 def _within_bounds(problem: Prepared, end: ModalFit) -> bool:

@@ -424,3 +424,12 @@ def test_statistics_that_lead_far_off_the_records_give_way_to_the_lines():
     test = draw(continuous(5), 2).measurement
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
     assert result.success and result.residual < 0.05
+
+
+def test_modes_far_above_the_lines_that_stand_for_a_gain_are_left_out_where_they_move_alike():
+    """Of a frame with five in the lines ten were found, and their normal equations were singular: nothing was told."""
+    test = draw(continuous(7), 1).measurement
+    misread = dataclasses.replace(test, base=0.98 * test.base)
+    result = sysid.identify(sysid.Problem(misread, mass=sysid.FullMass()), strategy="modal", rng=0)
+    assert ("gain", "base x") in [(one.kind, one.channel) for one in result.contradictions]
+    np.testing.assert_allclose(result.structure.natural_frequencies, continuous(7).frequencies[:5], rtol=1e-4)
