@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +44,11 @@ from sysid.modal_analysis.record_fit import (
     without,
 )
 from sysid.modal_analysis.residual_tests import (
+    at_lines,
     calibration_of,
     delays_left,
     delays_of,
+    deviations,
     excess_of,
     gain_errors_of,
     runs_in_motion,
@@ -161,9 +162,11 @@ def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
 def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
     """The fit without the delays that it finds itself, as long as these make it likelier.
 
-    Modes are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
+    Those that the first modes show are taken off before any others are looked for, which would stand for them. Modes
+    are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
     """
-    fit = _whole_fit(without_delays(test, delays), monitor)
+    delays, first = _first_delays(test, delays, monitor)
+    fit = _whole_fit(without_delays(test, delays), monitor, first)
     try:
         for _ in range(rounds):
             # What shares of the signal hold of a delay hides it: then it shows by what the fit gains without it.
@@ -189,9 +192,34 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     return fit
 
 
-def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+def _first_delays(
+    test: Measurement, delays: Array, monitor: FitMonitor, times: float = 25.0
+) -> tuple[Array, RecordFit | None]:  # fmt: skip
+    """Delays, s, with those that the first modes show by `times` their price, and these modes where they are none.
+
+    Modes that are still missing may look like small ones, which are left to the fit of all modes.
+    """
+    lines = decimated_lines(test)
+    some = without_delays(test if np.all(lines) else test.at(lines), delays)
     try:
-        fit = _white_fit(test, monitor)
+        first = _first_fit(some, monitor)
+    except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
+        return delays, None
+    p, none = first.parameters, np.zeros((first.model.m,) * 2)  # couplings turn residues too: late is what they do not
+    marginal, left = delays_left(replace(first, parameters=replace(p, coupling=none))), delays_left(first)
+    if first.model.whole.grows or marginal is None or not np.any((delays + marginal != 0) & (delays == 0)):
+        return delays, first
+    left = marginal if left is None or np.any((left != 0) != (marginal != 0)) else left
+    total, monitor.doing = delays + left, "delays"
+    trial = on_turned(first, without_delays(some, left), monitor=monitor)
+    price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
+    late = trial.schwarz - first.schwarz >= times * price * np.log(first.model.numbers) / 2
+    return (total, None) if late else (delays, first)
+
+
+def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
+    try:
+        fit = _white_fit(test, monitor, first)
     except (InputError, np.linalg.LinAlgError) as error:
         sentence = steady_sine(test)
         if sentence is None:
@@ -205,28 +233,32 @@ def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     return fit
 
 
-def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
     """The fit with one level of noise a channel and run.
 
-    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
-    some of them, from which the fit of all begins.
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found, where it is not given;
+    where lines are many, on some of them, from which the fit of all begins.
     """
     lines = decimated_lines(test)
     if not np.all(lines):
         some = test.at(lines)
-        fit = _white_fit(some, monitor)
+        fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
         fit = on_all_lines(fit, test, monitor=monitor)
         monitor.keep(fit)
         return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
-    monitor.doing = "poles by rough weights"
-    poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
-    fit = _fitted(test, poles, monitor)
+    fit = _first_fit(test, monitor) if first is None else first
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):
         fit = max(fit, _fitted(test, again, monitor, beside=fit), key=lambda one: one.schwarz)
     return _with_all_modes(fit, monitor)
+
+
+def _first_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+    """The fit of one mode at each pole that rough weights show."""
+    monitor.doing = "poles by rough weights"
+    return _fitted(test, find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor), monitor)
 
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
@@ -288,30 +320,6 @@ def _least(fit: RecordFit) -> NDArray[np.bool_]:
             break
         gone = more
     return gone
-
-
-def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
-    """Standard deviations ``sqrt(E|e|²)`` of responses and force at each line: their own noise and the base's."""
-    test, model = fit.test, fit.model
-    parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
-    c = model.channels
-    for chunk in model.chunks(fit.parameters):
-        variances = chunk.run.variances(fit.levels)
-        parts[chunk.run.number].append(np.sqrt(variances[:c] + np.sum(np.abs(chunk.H) ** 2 * variances[c:], axis=1)))
-    std = _at_lines(test, parts)
-    for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
-        run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
-    n = test.n_sensors
-    return std[:, :n], std[:, n:] if model.force else None
-
-
-def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any]:
-    """Chunks of each run's own lines as (runs, channels, n_freq), zero at the lines of others."""
-    joined = [np.concatenate(run, axis=1) for run in parts]
-    out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
-    for at, lines, run in zip(out, test.own_lines, joined, strict=True):
-        at[:, lines] = run
-    return out
 
 
 def fit_modes(
@@ -456,7 +464,7 @@ def without_transients(fit: RecordFit) -> Measurement:
         at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
         predicted = np.einsum("cdl,dl->cl", at_rest.H, chunk.run.base)
         free[chunk.run.number].append(chunk.run.outputs - chunk.error - predicted)
-    taken = _at_lines(test, free)
+    taken = at_lines(test, free)
     n = test.n_sensors
     std, force_std = deviations(fit)
     return replace(

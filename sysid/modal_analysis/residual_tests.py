@@ -17,11 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -58,6 +60,30 @@ def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
                     int(channel), number, float(freq[first]), float(freq[last - 1]), factor
                 )))  # fmt: skip
     return tuple(one for _, one in sorted(found, key=lambda pair: -pair[0]))
+
+
+def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
+    """Standard deviations ``sqrt(E|e|²)`` of responses and force at each line: their own noise and the base's."""
+    test, model = fit.test, fit.model
+    parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
+    c = model.channels
+    for chunk in model.chunks(fit.parameters):
+        variances = chunk.run.variances(fit.levels)
+        parts[chunk.run.number].append(np.sqrt(variances[:c] + np.sum(np.abs(chunk.H) ** 2 * variances[c:], axis=1)))
+    std = at_lines(test, parts)
+    for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
+        run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
+    n = test.n_sensors
+    return std[:, :n], std[:, n:] if model.force else None
+
+
+def at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any]:
+    """Chunks of each run's own lines as (runs, channels, n_freq), zero at the lines of others."""
+    joined = [np.concatenate(run, axis=1) for run in parts]
+    out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
+    for at, lines, run in zip(out, test.own_lines, joined, strict=True):
+        at[:, lines] = run
+    return out
 
 
 def noise_powers(fit: RecordFit) -> list[Array]:
