@@ -150,9 +150,11 @@ def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
 def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
     """The fit without the delays that it finds itself, as long as these make it likelier.
 
-    Modes are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
+    Those that the first modes show are taken off before any others are looked for, which would stand for them. Modes
+    are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
     """
-    fit = _whole_fit(without_delays(test, delays), monitor)
+    delays, first = _first_delays(test, delays, monitor)
+    fit = _whole_fit(without_delays(test, delays), monitor, first)
     try:
         for _ in range(rounds):
             # What shares of the signal hold of a delay hides it: then it shows by what the fit gains without it.
@@ -178,9 +180,34 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     return fit
 
 
-def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+def _first_delays(
+    test: Measurement, delays: Array, monitor: FitMonitor, times: float = 25.0
+) -> tuple[Array, RecordFit | None]:  # fmt: skip
+    """Delays, s, with those that the first modes show by `times` their price, and these modes where they are none.
+
+    Modes that are still missing may look like small ones, which are left to the fit of all modes.
+    """
+    lines = decimated_lines(test)
+    some = without_delays(test if np.all(lines) else test.at(lines), delays)
     try:
-        fit = _white_fit(test, monitor)
+        first = _fitted(_rough_fit(some, monitor), monitor)
+    except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
+        return delays, None
+    p, none = first.parameters, np.zeros((first.model.m,) * 2)  # couplings turn residues too: late is what they do not
+    marginal, left = delays_left(replace(first, parameters=replace(p, coupling=none))), delays_left(first)
+    if first.model.whole.grows or marginal is None or not np.any((delays + marginal != 0) & (delays == 0)):
+        return delays, first
+    left = marginal if left is None or np.any((left != 0) != (marginal != 0)) else left
+    total, monitor.doing = delays + left, "delays"
+    trial = on_turned(first, without_delays(some, left), monitor=monitor)
+    price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
+    late = trial.schwarz - first.schwarz >= times * price * np.log(first.model.numbers) / 2
+    return (total, None) if late else (delays, first)
+
+
+def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
+    try:
+        fit = _white_fit(test, monitor, first)
     except (InputError, np.linalg.LinAlgError) as error:
         sentence = steady_sine(test)
         if sentence is None:
@@ -194,21 +221,21 @@ def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     return fit
 
 
-def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
     """The fit with one level of noise a channel and run.
 
-    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
-    some of them, from which the fit of all begins.
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found, where it is not given;
+    where lines are many, on some of them, from which the fit of all begins.
     """
     lines = decimated_lines(test)
     if not np.all(lines):
         some = test.at(lines)
-        fit = _white_fit(some, monitor)
+        fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
         fit = on_all_lines(fit, test, monitor=monitor)
         monitor.keep(fit)
         return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
-    fit = _fitted(_rough_fit(test, monitor), monitor)
+    fit = _fitted(_rough_fit(test, monitor), monitor) if first is None else first
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):

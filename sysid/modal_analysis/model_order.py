@@ -170,7 +170,7 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         peak = next((one for one in peaks_of(fit, price) if last < one.omega < far), None)
         if peak is None:
             return fit
-        more = refitted(fit, _with(fit, fit.parameters, peak), monitor=monitor)
+        more = refitted(fit, _with(fit, fit.parameters, peak), limits=TRIAL, monitor=monitor)
         omega = more.parameters.modes.omega[: -fit.static]
         stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
         if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):

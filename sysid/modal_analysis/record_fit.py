@@ -30,11 +30,7 @@ from sysid.modal_analysis.noise_levels import (
     plain_levels,
     rough_levels,
 )
-from sysid.modal_analysis.record_model import (
-    NormalEquations,
-    Parameters,
-    RecordModel,
-)
+from sysid.modal_analysis.record_model import NormalEquations, Parameters, RecordModel
 from sysid.modal_analysis.residues import Records
 from sysid.structure.amplitude import FittedLaw, LawForm, laws_from_tree, laws_to_tree
 from sysid.structure.structure import Array
@@ -46,13 +42,14 @@ _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels 
 
 
 class Limits(NamedTuple):
-    """Limits of a fit: rounds of modes and levels in turn, steps of each round."""
+    """Limits of a fit: rounds of modes and levels in turn, steps of each, further rounds where levels alone move."""
 
     rounds: int
     steps: int
+    further: int = 0
 
 
-WHOLE, TRIAL, ROUGH = Limits(12, 60), Limits(12, 8), Limits(3, 4)
+WHOLE, TRIAL, ROUGH = Limits(12, 60, 12), Limits(12, 8), Limits(3, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +312,7 @@ def fit_model(
     elif levels is None:
         levels = rough_levels(model, p)
     settled, chi2, equations = False, np.inf, _Equations(model, coarse)
-    for round_ in range(limits.rounds):
+    for round_ in range(limits.rounds + limits.further):
         if round_ and model.whole.grows:  # held within a round: varying without log det it would bias the modes
             model = model.at_signal(p)
             equations = _Equations(model, coarse and coarse.at_signal(p))
@@ -328,6 +325,8 @@ def fit_model(
         changes = [np.log(run.variances(levels) / run.variances(before)) for run in model.runs]
         if done and max(np.abs(one).max() for one in changes) < 2 * _SAME_LEVELS:
             settled = True
+            break
+        if not done and round_ + 1 >= limits.rounds:
             break
     if stated is None:
         chi2 = model.at_signal(p).chi2(p, levels)  # at the last levels
