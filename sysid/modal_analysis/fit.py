@@ -166,8 +166,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                     continue
                 monitor.doing, turned = "delays", without_delays(test, total)
                 trial = _whole_fit(turned, monitor) if np.any(new) else on_turned(fit, turned, monitor=monitor)
-                price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
-                if trial.schwarz - fit.schwarz >= times * price * np.log(fit.model.numbers) / 2:
+                if trial.schwarz - fit.schwarz >= times * _price(total, delays, fit):
                     fit, delays = trial, total
                     break
             else:
@@ -200,9 +199,14 @@ def _first_delays(
     left = marginal if left is None or np.any((left != 0) != (marginal != 0)) else left
     total, monitor.doing = delays + left, "delays"
     trial = on_turned(first, without_delays(some, left), monitor=monitor)
-    price = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
-    late = trial.schwarz - first.schwarz >= times * price * np.log(first.model.numbers) / 2
+    late = trial.schwarz - first.schwarz >= times * _price(total, delays, first)
     return (total, None) if late else (delays, first)
+
+
+def _price(total: Array, delays: Array, fit: RecordFit) -> float:
+    """Schwarz's price of the delays `total` in place of `delays`; equal ones are one number."""
+    more = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
+    return float(more * np.log(fit.model.numbers) / 2)
 
 
 def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
