@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -107,12 +106,14 @@ def leakage_moves(
 
     With x_k the lines of a block before the window, the motion of the base is ``X_k = x_k / 2 - (x_k-1 + x_k+1) / 4``,
     and what a channel answers beyond ``H(w_k) X_k`` is ``H'(w_k) h (x_k-1 - x_k+1) / 4``, h the distance of lines. So
-    H1 of M blocks is off by ``H'(w_k) u_k``, ``E|u_k|^2 = h^2 / (3 M)``, in all channels at once; with
+    H1 of M blocks, of directions tested one after another, is off by ``H'(w_k) u_k``, ``E|u_k|^2 = h^2 / (3 M)``, in
+    all channels at once; with
 
     .. math:: E[u_k u_l^*] \sim (12, 0, -1), \quad E[u_k u_l] \sim (0, -4, -1) \quad \text{at } |k - l| = 0, 1, 2.
 
     Of smooth sums the real part vanishes, by which frequencies move; that of the imaginary part, by which damping does,
-    is larger than of independent errors, and more channels do not lower it. Zero columns for other tests; `normals`
+    is larger than of independent errors, and more channels do not lower it. Coherences count the same errors once more,
+    as independent ones: with few channels the sum is on the safe side. No columns for other tests; `normals`
     are those of `spread` where the weights are the noise's, a factor of half the inverse of the information.
     """
     if test.window != "taken off" or test.averaged < 2:
@@ -120,14 +121,18 @@ def leakage_moves(
     spacing, spectra = float(np.diff(test.freq).min()), spectra_of(test, modes).conj()
     pulls = np.zeros((index.size, spectra.shape[1]), complex)
     for kind, (whole, record) in enumerate(zip((test.predict, test.predict_force), records, strict=False)):
-        slopes = columns(np.gradient(whole(structure), spacing, axis=-1))
+        slopes = columns(np.gradient(whole(structure), test.freq, axis=-1))
         for i, (slope, weight) in enumerate(zip(slopes, record.weight, strict=True)):
             at, rows = _gradient_rows(modes, index, kind, i, spectra * (weight**2 * slope))
             pulls[at] += rows
-    seen = (normals.T @ pulls).reshape(normals.shape[1], test.n_runs, -1)
+    from scipy.ndimage import convolve1d
+
+    place = np.round((test.freq - test.freq[0]) / spacing).astype(int)  # lines may be left out between
+    seen = np.zeros((normals.shape[1], test.n_runs, place[-1] + 1), complex)
+    seen[..., place] = (normals.T @ pulls).reshape(normals.shape[1], test.n_runs, -1)
     # Of real and imaginary parts of u, in units of h² / (36 M).
     both = (seen.real, [6.0, -2.0, -1.0]), (seen.imag, [6.0, 2.0, 0.0])
-    shared = [scipy.ndimage.convolve1d(x, [*c[:0:-1], *c], mode="constant") for x, c in both]
+    shared = [convolve1d(x, [*c[:0:-1], *c], mode="constant") for x, c in both]
     variance = sum(np.einsum("arl,brl->ab", x, y) for (x, _), y in zip(both, shared, strict=True))
     lam, turn = np.linalg.eigh(variance * spacing**2 / (36 * test.averaged))
     return 2 * normals @ (turn * np.sqrt(np.maximum(lam, 0.0)))

@@ -20,6 +20,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, residual_share
 from sysid.models.model import Geometry, Stated
 from sysid.problem.formulation import Formulation
@@ -314,10 +315,13 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     Where it is, an amplitude counts by the noise at its own lines, and `_RESOLVED` of its standard deviations will do;
     where the misfit is larger than that noise, so is what may look like a mode.
     """
-    if std is not None:
+    if std is not None and np.any(std):
         weight = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
-        size, left = (float(np.linalg.norm(part * weight)) for part in (record, record - predicted))
+        error = (record - predicted) * weight
+        size, left = float(np.linalg.norm(record * weight)), float(np.linalg.norm(error))
         more = max(1.0, left / np.sqrt(np.count_nonzero(weight)) / _AS_STATED)
+        if more > 1:  # what a model misses neighbouring lines share
+            more *= np.sqrt(line_correlation(error.swapaxes(0, 1)))
         return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise, sizes = rms(record - predicted), rms(record)

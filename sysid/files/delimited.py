@@ -57,6 +57,8 @@ def _number(field: str) -> complex | None:
     except ValueError:
         if match := _CLOCK.fullmatch(field):
             hours, half = int(match[1] or 0), (match[4] or "").upper()
+            if half in ("AM", "PM") and match[1] is None:  # hours and minutes
+                return None
             hours = hours % 12 + 12 * (half == "PM") if half in ("AM", "PM") else hours
             return 3600.0 * hours + 60.0 * int(match[2]) + float(match[3])
         if re.fullmatch(_DATE, field):
@@ -75,7 +77,7 @@ def read_delimited(path: Path) -> list[Recording]:
     form, width = _form(lines, path)
     rows = [(number, form.fields(line)) for number, line in enumerate(lines, 1) if line.strip(" \t\r\x1a\0")]
     first = next(
-        at for at, (_, row) in enumerate(rows) if len(row) == width and any(row) and form.numbers(row) is not None
+        at for at, (_, row) in enumerate(rows) if len(row) == width and np.any(np.isfinite(form.numbers(row) or np.nan))
     )
     body, remarks = rows[first:], []
     number, last = body[-1]

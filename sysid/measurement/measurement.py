@@ -373,6 +373,7 @@ class Measurement:
         choice("window", window, ("", "hann"))
         stated = coherence is not None or force_coherence is not None
         refuse((stated and averages is None, "coherences tell noise where averages= is given, such as 40"))
+        averages = 0 if averages is None else whole_number("averages", averages, at_least=2)
         read = numbers if missing == "drop" else complete  # lines with NaN go where the records have all runs
         H = read("frf", frf, complex)
         H = checked_lines("frf", H[:, None] if H.ndim == 2 else H, lines.size, read)
@@ -383,8 +384,7 @@ class Measurement:
         for name, function, known in (("coherence", H, coherence), ("force_coherence", F, force_coherence)):
             if known is not None and function is not None:
                 seen = spectra.coherence_of(name, known, function.shape)
-                count = whole_number("averages", averages, at_least=2)
-                std = spectra.std_of_functions(function, seen, count)
+                std = spectra.std_of_functions(function, seen, averages)
                 response_std, force_std = (std, force_std) if function is H else (response_std, std)
         given = (
             H, F, checked_deviations("response_std", response_std, H, read),

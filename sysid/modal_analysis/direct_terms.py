@@ -162,7 +162,10 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
                 break
     except (InputError, np.linalg.LinAlgError):
         lefts = []
-    if not lefts or lefts[-1] - lefts[0] > beyond_chance(2 * test.n_runs * (test.n_sensors + test.n_base + 1)):
+    channels = test.n_sensors + (0 if test.force is None else test.n_base)
+    stated = test.response_std is not None and (test.force is None or test.force_std is not None)
+    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 if stated else 0.0
+    if not lefts or lefts[-1] - lefts[0] > chance:
         rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
         turned = replace(test, window="")
     of_response, of_force = np.split(np.abs(rest), [test.n_sensors], axis=1)

@@ -452,11 +452,11 @@ def _early_laws(
     try:
         with monitor.at_work():
             rough = at_all_lines(_rough_fit(test.at(decimated_lines(test)), monitor), test)
+        if left_of(rough) < much:
+            return None
+        found = with_laws(rough, stated, monitor=monitor, probe=True)
     except (InputError, np.linalg.LinAlgError):  # told by the whole fit
         return None
-    if left_of(rough) < much:
-        return None
-    found = with_laws(rough, stated, monitor=monitor, probe=True)
     if found.stopped:
         return found
     if not found.parameters.laws or found.model.whole.plain:
@@ -466,7 +466,9 @@ def _early_laws(
             more = _pruned(with_further_modes(found, monitor=monitor), monitor)
     except (Stop, KeyboardInterrupt):
         return replace(found, stopped=True)
-    return replace(more, left_out=found.left_out)
+    omega, first = more.parameters.modes.omega, more.parameters.laws[0].mode
+    lower = (omega >= 2 * np.pi * test.freq[0]) & (omega < omega[first])
+    return None if np.any(lower) else more  # the first mode is another one
 
 
 @one_thread()
@@ -482,6 +484,8 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         index.log_omega.start + order, index.log_ratios.start + order, index.rigid,
     ])  # fmt: skip
     grows = fit.model.whole.grows  # lines that stand for themselves hold no transients
+    there = np.ones(m, bool) if fit.kept is None else fit.kept
+    laws = (law for law, of in zip(fitted_laws(fit), p.laws, strict=True) if there[of.mode])
     found = ModalEstimate(
         replace(fit.test, whole=None) if grows else fit.test, without_transients(fit),
         *modes.at(order), p.rigid,
@@ -490,6 +494,6 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
         excess_of(fit), varying_levels(fit), runs_in_motion(fit),
         () if fit.model.whole.plain else unidentifiable_levels(fit),
         record_fit=fit, static=fit.static, coupling=coupling_of(fit.model, p, fit.normal, order, at),
-        delays=delays_of(fit), calibration=calibration, laws=(*fitted_laws(fit), *fit.left_out),
+        delays=delays_of(fit), calibration=calibration, laws=(*laws, *fit.left_out),
     )  # fmt: skip
     return found if fit.kept is None else found.at(fit.kept[order])

@@ -265,7 +265,8 @@ def refitted(
     """
     fit = fit if static is None else replace(fit, static=static)
     coarse = None if some is None else fit.model_of(p, some).weighed_as_all()
-    return fit_model(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
+    found = fit_model(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
+    return replace(found, left_out=fit.left_out)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:

@@ -243,7 +243,6 @@ class Prepared(SearchSpace):
         if count is not None:
             more = with_so_many_modes(more, count, self.of_structure(more.parameters.modes.omega))
         if more is not fit:
-            more = replace(more, left_out=fit.left_out)
             self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
 
     def fit_modes(self, monitor: FitMonitor) -> None:

@@ -231,3 +231,13 @@ def test_a_mode_too_faint_for_the_force_is_weighed_by_a_lumped_mass():
     off = np.diag(lumped.structure.mass)[:2] - mass
     assert np.all(np.abs(off) < 5 * np.diag(lumped.uncertainty.mass))
     assert np.all(np.diag(lumped.uncertainty.mass) < 0.05 * mass)
+
+
+def test_deviations_that_are_all_zero_tell_no_noise():
+    freq = np.linspace(1.0, 20.0, 120)
+    K = (2 * np.pi * 8.0) ** 2 * 10 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    truth = sysid.Structure(np.diag([10.0, 5.0]), K, [0.02], n_base=1)
+    test = sysid.simulate(truth, freq, force=True, noise=0.001, rng=0)
+    given = dataclasses.replace(test, response_std=np.full(test.response.shape, 1e-3), force_std=0 * test.force.real)
+    result = sysid.identify(sysid.Problem(given, mass=sysid.FullMass()), rng=0)
+    np.testing.assert_allclose(result.structure.natural_frequencies, truth.natural_frequencies, rtol=1e-3)

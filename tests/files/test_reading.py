@@ -396,3 +396,10 @@ def test_files_of_one_sensor_each_are_joined_to_runs_by_their_folders(tmp_path):
     np.savetxt(paths[1], np.array(late).T, fmt="%.17g", delimiter=";", header="time [s];acc", comments="")
     with pytest.raises(sysid.InputError, match=r"b\.csv.*sample 1 is at 0.5 s, that of a\.csv at 0 s.*sysid\.resample"):
         reading.gather(paths[:2], {"join": True, "sensor": sensors})
+
+
+def test_a_date_above_the_header_is_no_row_of_the_table(tmp_path):
+    rows = ["Shaker test;;;", "01.02.2024;;;", "Time [s];table [g];top [mm/s²];force [kN]"]
+    rows += [f"{i / 200:.3f};{i % 7};{i % 5};{i % 3}" for i in range(100)]
+    (tmp_path / "run.csv").write_text("\n".join(rows), encoding="utf-8")
+    assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == 200

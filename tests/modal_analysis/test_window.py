@@ -142,3 +142,18 @@ def test_a_zero_among_functions_is_no_reason_to_keep_the_window() -> None:
     H, std = given.response.copy(), given.response_std.copy()
     H[0, 0, 5] = std[0, 0, 5] = 0.0
     assert without_window(replace(given, response=H, response_std=std)).window == "taken off"
+
+
+def test_units_of_functions_without_deviations_do_not_decide_whether_a_window_is_taken_off() -> None:
+    """Functions without any window, stated to have one: lines are explained worse without it, in any units."""
+    true = functions(noise=1e-4)[1]
+    for unit in (1.0, 1e-3, 1e3):
+        stated = replace(true, window="hann", response_std=None, force_std=None, force=unit * true.force)
+        assert without_window(stated).window == ""
+
+
+def test_a_number_of_blocks_is_a_whole_number() -> None:
+    given = functions()[0]
+    for wrong in ("40", 2.5, -5):
+        with pytest.raises(sysid.InputError, match="averages"):
+            sysid.Measurement.from_frf(FREQ, given.response[0], rigid_body=np.ones((2, 1)), averages=wrong)

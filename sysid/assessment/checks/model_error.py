@@ -260,7 +260,7 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
     for law in context.modal.laws:
         try:
-            mode = law.among(context.end.structure.natural_frequencies).mode + 1
+            mode = law.among(context.end.structure.natural_frequencies, 0.25).mode + 1
         except InputError:  # no mode of the answer
             continue
         low, high = law.levels
