@@ -391,9 +391,11 @@ def test_many_sensors_that_all_modes_move_alike_are_one_motion_whatever_noise_ad
     s = 2j * np.pi * freq
     gain = -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
     motion = rng.normal(size=(n, 1)) * gain.sum(axis=0)
-    motion = motion + 0.01 * np.abs(motion).mean() * complex_noise(rng, motion.shape)
+    noise = 0.01 * np.abs(motion).mean()
+    motion = motion + noise * complex_noise(rng, motion.shape)
     phi = np.linalg.lstsq(np.hstack([gain.real, gain.imag]).T, np.hstack([motion.real, motion.imag]).T, rcond=None)[0].T
-    test = sysid.Measurement(freq, np.ones((1, 1, 300), complex), (1 + motion)[None], rigid_body=np.ones((n, 1)))
+    base, std = np.ones((1, 1, 300), complex), np.full(motion.shape, noise)[None]  # stated, as to find it takes long
+    test = sysid.Measurement(freq, base, (1 + motion)[None], rigid_body=np.ones((n, 1)), response_std=std)
     modes = Modes(phi, np.ones((m, 1)), omega, ratios)
     chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)).prepared, modes, None)
     assert (chosen.sensors.size, chosen.modes.size) == (1, m - 1)
