@@ -17,7 +17,13 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
-from sysid.modal_analysis.model_order import at_static_pole, in_gauge, least_worth, misses_modes_above
+from sysid.modal_analysis.model_order import (
+    at_static_pole,
+    in_gauge,
+    least_worth,
+    misses_modes_above,
+    with_static_modes,
+)
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     TRIAL,
@@ -85,12 +91,14 @@ def with_couplings(
     beyond, equations = max(fit.reduced, 1.0), model.normal_equations(p, fit.levels)
     promised, count = score_of_couplings(model, equations)
     above = (np.arange(model.size) >= model.n_fit + model.n * model.d) & (np.arange(model.size) < model.delays)
-    # What modes above the lines leave would pass for couplings of those that stand for them.
-    if promised < max(beyond * beyond_chance(count), score(equations, above)[0]):
+    if promised < beyond * beyond_chance(count):
         return fit
     monitor.doing = f"{m} modes and the dampers between them"
-    more = _coupled(fit, p, fit.static, pruned, some, monitor)
-    if not fit.static and model.force and misses_modes_above(more):  # which dampers couple with those in the lines
+    # What modes above the lines leave would pass for couplings of those that stand for them.
+    hidden = promised < score(equations, above)[0]
+    more = fit if hidden else _coupled(fit, p, fit.static, pruned, some, monitor)
+    above_them = not fit.static and model.force and (hidden or misses_modes_above(more))
+    if above_them:  # which dampers couple with those in the lines
         static = refitted(fit, at_static_pole(fit), some=some, limits=ROUGH, monitor=monitor, static=model.d)
         other = _coupled(fit, static.parameters, model.d, pruned, some, monitor)
         more = max(more, other, key=lambda one: one.schwarz)
@@ -102,7 +110,7 @@ def with_couplings(
     if single or not (
         more.settled and passive(more.parameters, 2 * np.pi * fit.test.freq[-1]) and gained > beyond * least
     ):
-        return fit
+        return with_static_modes(fit, monitor=monitor) if above_them else fit
     alone = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     if alone is None:
         return in_gauge(more) if model.force else fit  # which weighs the modes, so that couplings are symmetric
