@@ -146,6 +146,32 @@ def solve_modes(
     return ModalFit(modes, values[4], of_all, of_accelerations, status, z.on_bounds(best), weights)
 
 
+def free_spectrum(
+    omega: Array,
+    ratios: Array,
+    pole: NDArray[np.intp],
+    lower: float = 0.0,
+    upper: float = np.inf,
+    *,
+    held: NDArray[np.bool_],
+) -> Spectrum:
+    """Frequencies without bounds and damping ratios, of each pole that is not held; modes of one pole share them."""
+
+    def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
+        # In units of the half-power half-width, by which frequencies are known; cut off where no step of use leads.
+        room = np.where(held, 0.0, np.inf)
+        shift = z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios)
+        with np.errstate(divide="ignore"):
+            low, high = (np.where(held, 0.0, np.log(limit / ratios)) for limit in (lower, upper))
+        loss = z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high)
+        shift, loss = ca.fmin(ca.fmax(shift, -1.0), 1.0), ca.fmin(ca.fmax(loss, -10.0), 10.0)
+        moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
+        # Entries of a scalar are a row.
+        return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
+
+    return spectrum
+
+
 def _rigid_mass(
     z: NonlinearProgram, gamma: ca.MX, of_modes: Array, remainder: Array, unit: Array, *, every_rank: bool
 ) -> tuple[ca.MX, ca.MX]:

@@ -259,11 +259,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
     for law in context.modal.laws:
-        try:
-            mode = law.among(context.end.structure.natural_frequencies, 0.25).mode + 1
-        except InputError:  # no mode of the answer
+        nearest = law.mode_among(context.end.structure.natural_frequencies, 0.25)
+        if nearest is None:  # no mode of the answer follows it: `judge` tells it
             continue
-        low, high = law.levels
+        mode, (low, high) = nearest + 1, law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
         numbers |= {"change of frequency": f, "its deviation": std, "change of damping": zeta}
