@@ -59,7 +59,8 @@ class Measurement:
         Force of the base on the structure, N (N m): it tends to ``+M_rb u0''`` at low frequency.
     sensors : sequence of Sensor, optional
     response_std, force_std : array_like, optional
-        Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records.
+        Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records. The median stands for
+        zeros among others.
     base_axes : str or sequence of str, optional
         Names of the base directions (see `sysid.rigid_body`); by default those that the sensors' axes tell, else
         x y z rx ry rz in this order. Needed where fewer than four directions hold a rotation.

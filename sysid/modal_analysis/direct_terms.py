@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import blurred
+from sysid.measurement.whole import raised
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
@@ -184,7 +185,7 @@ def _by_window(
     And the sum of squares that the residues at all poles leave, in units of the noise.
     """
     every = np.concatenate([test.response] + ([] if test.force is None else [test.force]), axis=1)
-    deviations = (test.response_std, test.response), (test.force_std, test.force)
+    deviations = (raised(test.response_std), test.response), (raised(test.force_std), test.force)
     stds = [np.ones(H.shape) if std is None else std for std, H in deviations if H is not None]
     pole = omega * (-ratios + 1j * np.sqrt(1 - ratios**2))
     plain, hann = (
@@ -198,10 +199,8 @@ def _by_window(
     columns = np.concatenate([plain, np.stack([x**0 + 0j, 1j * x, x**2 + 0j])])
     size = np.sqrt(np.mean(np.abs(columns) ** 2, axis=1))
     off, left, std = np.zeros((2, *every.shape), complex), 0.0, np.concatenate(stds, axis=1)
-    weights = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
     for at in np.ndindex(every.shape[:2]):
-        weight = weights[at]
-        rows, data = weight * columns / size[:, None], weight * every[at]
+        rows, data = columns / std[at] / size[:, None], every[at] / std[at]
         found = np.linalg.lstsq(np.hstack([rows.real, rows.imag]).T, np.hstack([data.real, data.imag]), rcond=None)[0]
         left += float(np.sum(np.abs(data - found @ rows) ** 2))
         for which, added in zip((some, ~some), off, strict=True):
