@@ -362,7 +362,8 @@ def hessian_of(model: SpectraModel) -> NumpyFunction:
         plain, curved = model.slopes(model.unpack(theta), model.levels)
         return 2 * curved, -2 * plain.gradient
 
-    return NumpyFunction(size, [(size, size), (size, 1)], values)
+    column = ca.Sparsity.dense(size)
+    return NumpyFunction(values, [column], [ca.Sparsity.dense(size, size), column])
 
 
 def _derivatives(
