@@ -25,6 +25,7 @@ from sysid.measurement.whole import factors_of_runs
 from sysid.modal_analysis.direct_terms import (
     MOST_DAMPED,
     BesidePoles,
+    BesideTerms,
     beside_poles,
     beside_poles_at,
     telling_lines,
@@ -217,7 +218,7 @@ def _joined(test: Measurement) -> Measurement:
     )  # fmt: skip
 
 
-class _Late:
+class _Late(BesideTerms):
     """Channels without their delays, fitted on poles, residues and terms without; what is left tells of the delays.
 
     The terms are 1, and w² and i w³ of modes above the lines and of their damping. With `rising` a term ``i w`` too,
@@ -238,25 +239,12 @@ class _Late:
         self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array,
         complex_residues: bool = False, *, rising: bool = False,
     ) -> None:  # fmt: skip
-        self.still, self.clocks, self.delays, self.poles = still, clocks, delays, poles
-        self.complex_residues = complex_residues
-        self.omega, self.ratios = np.exp(poles.reshape(2, -1))
+        self.still, self.clocks, self.delays, self.complex_residues = still, clocks, delays, complex_residues
         self.test = test = without_delays(still, delays[clocks])
-        self.records = records = Records(test)
-        x = 1j * test.freq / test.freq[-1]
+        records, x = Records(test), 1j * test.freq / test.freq[-1]
         direct = records.basis(np.stack([x**0, x**2, x**3, x])[: 3 + rising], records.driven)
-        functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
-        direct = np.hstack([direct, _of_runs(test, records)])
-        self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
-        answered = self.basis.answers(records.data)
-        self.left = records.data - self.basis.times(answered)
-        beta = np.linalg.pinv(R, rcond=ROUND_OFF) @ answered / size[:, None]
-        of_poles = len(R) - functions.shared.shape[1]  # behind those of one run each, and those without poles
-        residues = functions.in_order([beta[: of_poles - direct.shape[1]], beta[of_poles:]])
-        self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
-        self.unknowns = len(R) * self.left.shape[1]
-        least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
-        self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+        super().__init__(records, poles, np.hstack([direct, _of_runs(test, records)]), velocity=complex_residues)
+        self.unknowns = self.count * self.left.shape[1]
 
     def moved(self, poles: Array, delays: Array) -> _Late:
         """The fit after a step, in which no pole becomes one that answers like a term without poles."""

@@ -285,32 +285,42 @@ def _without_poles(freq: Array) -> ComplexArray:
     return np.stack([np.ones_like(x) + 0j, 1j * x, x**2 + 0j])
 
 
-class AtPoles:
-    """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on those without poles.
+class BesideTerms:
+    """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on `direct` columns without poles.
 
-    Of the latter `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
+    With `velocity` residues have a part in quadrature too.
     """
 
-    def __init__(self, records: Records, poles: Array) -> None:
+    def __init__(self, records: Records, poles: Array, direct: Array, *, velocity: bool) -> None:
         self.records, self.poles = records, poles
         self.omega, self.ratios = np.exp(poles.reshape(2, -1))
-        direct = records.basis(_without_poles(records.freq), records.driven)
-        functions = records.functions(self.omega, self.ratios, velocity=True)
+        functions = records.functions(self.omega, self.ratios, velocity=velocity)
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
         answered = self.basis.answers(records.data)
         self.left = records.data - self.basis.times(answered)
         regular = scipy.linalg.lapack.dtrcon(R)[0] > ROUND_OFF
         inverse = scipy.linalg.lapack.dtrtri(R)[0] if regular else np.linalg.pinv(R, rcond=ROUND_OFF)
-        inverse /= size[:, None]
-        beta, self.count = inverse @ answered, len(R)
+        self.inverse = inverse / size[:, None]
+        self.beta, self.count = self.inverse @ answered, len(R)
         of_poles = self.count - functions.shared.shape[1]  # behind those of one run each, and those without poles
-        of_runs = of_poles - direct.shape[1]
-        at = slice(of_runs, of_runs + 2 * records.driven)
-        self.terms, self.rows = beta[at], inverse[at]
-        residues = functions.in_order([beta[:of_runs], beta[of_poles:]])
+        self.of_runs = of_poles - direct.shape[1]
+        residues = functions.in_order([self.beta[: self.of_runs], self.beta[of_poles:]])
         self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
         least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
         self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+
+
+class AtPoles(BesideTerms):
+    """The same with the terms 1, i w and w².
+
+    Of these `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
+    """
+
+    def __init__(self, records: Records, poles: Array) -> None:
+        direct = records.basis(_without_poles(records.freq), records.driven)
+        super().__init__(records, poles, direct, velocity=True)
+        at = slice(self.of_runs, self.of_runs + 2 * records.driven)
+        self.terms, self.rows = self.beta[at], self.inverse[at]
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:

@@ -316,6 +316,18 @@ def assemble(
     )
 
 
+def blocks_of_modes(
+    P: Array, gamma: Array, omega: Array, G: Array, remainder: Array
+) -> tuple[Array, Array, Array, Array]:
+    """M_SS, M_S0, M_00 and K_SS of modes: P (n, n) the inverse of their shapes at the degrees of freedom, rad/s.
+
+    `gamma` and G (n, d) are participations and rigid motion, `remainder` (d, d) the rigid-body mass that no mode
+    carries.
+    """
+    delta = gamma - P @ G
+    return P.T @ P, P.T @ delta, delta.T @ delta + remainder, (P.T * omega**2) @ P
+
+
 class Blocks(NamedTuple):
     """The matrices as expressions.
 

@@ -28,7 +28,7 @@ from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, ended_in_words
-from sysid.problem.matrices import assemble
+from sysid.problem.matrices import assemble, blocks_of_modes
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom, sensors_by_name
@@ -132,34 +132,24 @@ def structure_of_modes(
     Dampers have ``Phi' C Phi`` off its diagonal: `coupling` (m, m), rad/s; of residual modes `across` (r, m + r).
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
     """
-    geometry = problem.geometry
     P, G, groups = chosen.coordinates(problem, modes.phi)
     recovery = modes.phi @ P
     # Exact where a degree of freedom is a sensor.
     recovery[chosen.sensors] = np.eye(len(P))[: chosen.sensors.size]
     gamma = modes.gamma
-    plain = chosen.modes.size == 0 and chosen.sensors.size == geometry.n
+    plain = chosen.modes.size == 0 and chosen.sensors.size == problem.geometry.n
     if to_totals:
         known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma, residual = P * np.sqrt(t), gamma * np.sqrt(t), residual.scaled(np.sqrt(t))
     if across is not None and np.any(across):
         residual = replace(residual, coupling=np.hstack([across[:, : len(P)] @ P, across[:, len(P) :]]))
-    M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
-    M_S0 = P.T @ gamma - M_SS @ G
-    delta = gamma - P @ G
-    K_S0 = -K_SS @ G
-    return Structure(
-        np.block([[M_SS, M_S0], [M_S0.T, delta.T @ delta + remainder]]),
-        np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
-        modes.ratios if coupling is None else None,
-        damping_matrix=None if coupling is None else P.T @ (np.diag(2 * modes.ratios * modes.omega) + coupling) @ P,
-        n_base=geometry.d,
-        recovery=None if plain else recovery,
-        rigid_body=None if plain else geometry.rigid_body,
-        sensors=problem.measurement.sensors,
-        residual=residual,
-    )
+    found = assemble(
+        *blocks_of_modes(P, gamma, modes.omega, G, remainder), G, test=problem.measurement,
+        ratios=modes.ratios if coupling is None else None, recovery=None if plain else recovery,
+        damping=None if coupling is None else P.T @ (np.diag(2 * modes.ratios * modes.omega) + coupling) @ P,
+    )  # fmt: skip
+    return found.with_residual(residual)
 
 
 def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
