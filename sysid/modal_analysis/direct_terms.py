@@ -23,6 +23,7 @@ from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.response import states_noise
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
@@ -164,8 +165,7 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
     except (InputError, np.linalg.LinAlgError):
         lefts = []
     channels = test.n_sensors + (0 if test.force is None else test.n_base)
-    stated = test.response_std is not None and (test.force is None or test.force_std is not None)
-    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 if stated else 0.0
+    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 if states_noise(test) else 0.0
     if not lefts or lefts[-1] - lefts[0] > chance:
         rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
         turned = replace(test, window="")

@@ -20,6 +20,7 @@ from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.response import states_noise
 from sysid.problem.matrices import assemble, blocks_of_modes
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
@@ -266,9 +267,7 @@ def _in_words(problem: Prepared, stated: Statements, row: int, value: float, off
 def _numbers(problem: Prepared, index: Index) -> float:
     """Degrees of freedom of the records' own noise; infinite where it is stated."""
     test = problem.measurement
-    if test.response_std is not None and (test.force is None or test.force_std is not None):
-        return np.inf
-    return float(max(2 * test.numbers - index.size, 1))
+    return np.inf if states_noise(test) else float(max(2 * test.numbers - index.size, 1))
 
 
 def _chance(found: Adjusted, numbers: float) -> float:

@@ -18,7 +18,8 @@ from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
 from sysid.modal_analysis.fit import of_calibrated_lines
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
+from sysid.modal_analysis.outliers import HUBER, loss, whitened
+from sysid.modal_analysis.response import predicted
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.search.continuation import Continuation
