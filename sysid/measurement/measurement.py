@@ -9,16 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import (
-    InputError,
-    as_float,
-    check_frequencies,
-    choice,
-    numbers,
-    refuse,
-    sequence,
-    whole_number,
-)
+from sysid.errors import InputError, as_float, check_frequencies, choice, numbers, refuse, sequence, whole_number
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
 from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present

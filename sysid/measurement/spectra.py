@@ -190,12 +190,7 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
     n = runs[0].response.shape[0]
     force, force_std = (None, None) if runs[0].force is None else (frf[n:], frf_std[n:])
     return Estimate(
-        freq=freq,
-        frf=frf[:n],
-        frf_std=frf_std[:n],
-        force=force,
-        force_std=force_std,
-        coherence=coherence[:, :n].T,
+        freq=freq, frf=frf[:n], frf_std=frf_std[:n], force=force, force_std=force_std, coherence=coherence[:, :n].T
     )
 
 

@@ -86,10 +86,7 @@ def _numbers(name: str, value: Any) -> Array:
             f"Problem: {name} ({user_site()}) is complex, and a matrix of a structure is real: give its real part; "
             "a loss factor eta of a complex stiffness is a damping ratio eta / 2 of each mode, damping=[eta / 2, ...]",
         ),
-        (
-            matrix.ndim not in _DIMENSIONS[name],
-            f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}",
-        ),
+        (matrix.ndim not in _DIMENSIONS[name], f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}"),
     )
     return matrix.real.copy()
 

@@ -32,10 +32,7 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
 STRATEGIES: tuple[type[Modal] | type[Continuation] | type[Swarm], ...] = (Modal, Continuation, Swarm)  # as "auto" goes
-NAMED: dict[str, Callable[[], Strategy]] = {
-    **{kind.name: kind for kind in STRATEGIES},
-    "hpso-ls": Swarm.published,
-}
+NAMED: dict[str, Callable[[], Strategy]] = {**{kind.name: kind for kind in STRATEGIES}, "hpso-ls": Swarm.published}
 NAMES = ", ".join(map(repr, ("auto", *NAMED)))
 
 Start = ArrayLike | Structure | None

@@ -108,11 +108,7 @@ _SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how th
 
 
 def fit_in_matrices(
-    problem: Prepared,
-    x: Array,
-    monitor: IterationMonitor,
-    max_iterations: int,
-    smoothed: Sequence[TestTerm] = (),
+    problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int, smoothed: Sequence[TestTerm] = ()
 ) -> End:
     """Minimise the objective of a problem over its own unknowns, from `x`.
 

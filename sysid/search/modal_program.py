@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import (
-    ModalEstimate,
-    factor_of,
-    index_of,
-    residual_of,
-    scale_in,
-    theta_of,
-)
+from sysid.modal_analysis.modal_estimate import ModalEstimate, factor_of, index_of, residual_of, scale_in, theta_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
