@@ -448,4 +448,4 @@ def checked_deviations(
         raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
-    return np.where(full == 0, np.median(full[full > 0]), full) if np.any(full > 0) else full
+    return np.where(full == 0, np.median(full[full > 0].tolist() or [0.0]), full)

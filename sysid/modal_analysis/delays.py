@@ -83,13 +83,9 @@ class Delays:
         values[told], std[told] = self.values, self.std
         return Delays(values, std, self.of_base)
 
-    def to_tree(self) -> dict[str, Any]:
-        """Give the fields by their names; `from_tree` takes them back."""
-        return {"values": self.values, "std": self.std, "of_base": self.of_base}
-
     @classmethod
     def from_tree(cls, tree: dict[str, Any], test: Measurement) -> Delays:
-        """Give those of a test that `to_tree` made a tree of; refused where they are of another."""
+        """Those of a test with these fields; refused where they are of another."""
         found, shape = cls(**tree), cls.none(test).values.shape
         parts = found.values, found.std
         sound = all(isinstance(one, np.ndarray) and one.shape == shape and np.all(np.isfinite(one)) for one in parts)
@@ -99,9 +95,8 @@ class Delays:
 
 def stored_delays(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Delays]:
     """Delays of the tests of a stored problem; results of before hold none."""
-    none = [Delays.none(test).to_tree() for test in tests]
-    found = zip(tree.get("delays") or none, none, tests, strict=False)
-    return [Delays.from_tree(one or other, test) for one, other, test in found]
+    given = zip(tree.get("delays") or [None] * len(tests), tests, strict=False)
+    return [Delays.none(test) if one is None else Delays.from_tree(one, test) for one, test in given]
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,7 +148,7 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
     even = np.allclose(test.freq / spacing, np.round(test.freq / spacing), atol=0.01)
     turned = test = replace(test, window="taken off")
     lefts: list[float] = []
-    last, rest = np.zeros(1), np.zeros(1)
+    last, rest = np.zeros(1), blurred(test.outputs)
     try:
         for _ in range(rounds if even and test.has_unit_runs else 0):
             beside = beside_poles(turned)
@@ -156,19 +156,17 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
                 break
             wide = beside.at.ratios * beside.at.omega > np.pi * spacing
             (off, narrow), left = _by_window(turned, beside.at.omega, beside.at.ratios, wide, spacing)
-            force = None if test.force is None else test.force - off[:, test.n_sensors :]
-            before, turned = turned, replace(test, response=test.response - off[:, : test.n_sensors], force=force)
+            before, turned = turned, test.less(off)
             size = 1e-3 * np.abs(test.response) if test.response_std is None else test.response_std
             lefts, rest, last = [*lefts, left], np.abs(narrow) + np.abs(off - last), off
             if np.all(np.abs(turned.response - before.response) < near * size):
                 break
     except (InputError, np.linalg.LinAlgError):
         lefts = []
-    channels = test.n_sensors + (0 if test.force is None else test.n_base)
-    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 if states_noise(test) else 0.0
+    channels = test.outputs.shape[1]
+    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 * states_noise(test)
     if not lefts or lefts[-1] - lefts[0] > chance:
-        rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
-        turned = replace(test, window="")
+        rest, turned = blurred(test.outputs), replace(test, window="")
     of_response, of_force = np.split(np.abs(rest), [test.n_sensors], axis=1)
     of_window = [
         None if std is None else np.hypot(std, error)
@@ -184,7 +182,7 @@ def _by_window(
 
     And the sum of squares that the residues at all poles leave, in units of the noise.
     """
-    every = np.concatenate([test.response] + ([] if test.force is None else [test.force]), axis=1)
+    every = test.outputs
     deviations = (raised(test.response_std), test.response), (raised(test.force_std), test.force)
     stds = [np.ones(H.shape) if std is None else std for std, H in deviations if H is not None]
     pole = omega * (-ratios + 1j * np.sqrt(1 - ratios**2))

@@ -137,9 +137,7 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
         of_ends = transients[:, :0] if rest else transients
         traces = test.whole.traces(test.freq[lines], test.freq[-1])[: test.whole.of_sampling]
         taken[run][:, lines] = _fitted(left[run][:, lines], of_ends[..., lines], traces)
-    s = test.n_sensors
-    force = None if test.force is None else test.force - taken[:, s:]
-    return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
+    return test.less(taken, whole=None)
 
 
 def _fitted(left: ComplexArray, transients: ComplexArray, traces: ComplexArray) -> ComplexArray:
@@ -171,7 +169,7 @@ def left_of(fit: RecordFit) -> float:
 
 def without_transients(fit: RecordFit) -> Measurement:
     """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
-    test, model, p, n = fit.test, fit.model, fit.parameters, fit.test.n_sensors
+    test, model, p = fit.test, fit.model, fit.parameters
 
     def transients(chunk: Chunk) -> ComplexArray:
         at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
@@ -179,10 +177,7 @@ def without_transients(fit: RecordFit) -> Measurement:
 
     taken = at_lines(fit, transients)
     std, force_std = deviations(fit)
-    return replace(
-        test, whole=None, response=test.response - taken[:, :n], response_std=std,
-        force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
-    )  # fmt: skip
+    return test.less(taken, whole=None, response_std=std, force_std=force_std)
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

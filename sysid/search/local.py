@@ -116,7 +116,7 @@ def fit_in_matrices(
     graphs of the derivatives are made, nothing is begun.
     """
     formulation, z = problem.formulation, NonlinearProgram()
-    modal = needs_modes(formulation)
+    modal = formulation.fits_records and formulation.matrices.by_ratios  # damping by ratios has no direct solve
     # The modes themselves stand for a free stiffness; of free modes only the plain entries are asked for here.
     apart = modal and formulation.stiffness.free and not problem.free_modes
     held = formulation.parts.stiffness if apart else slice(0, 0)
@@ -149,11 +149,6 @@ def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[T
     """All terms, with other records in the place of the tests', in their order; none given: as they are."""
     others = iter(smoothed)
     return [next(others, term) if isinstance(term, TestTerm) else term for term in formulation.terms]
-
-
-def needs_modes(formulation: Formulation) -> bool:
-    """True where modes are further unknowns: damping by ratios has no direct solve."""
-    return formulation.fits_records and formulation.matrices.by_ratios
 
 
 def _add_constraints(problem: Prepared, unknowns: ca.MX, z: NonlinearProgram) -> None:

@@ -142,7 +142,7 @@ class FittedLaw:
     def mode_among(self, frequencies: Array, within: float = 0.1) -> int | None:
         """Number of the nearest of some modes, Hz, (m,); None where it is not `within` this share of the law's."""
         apart = np.abs(frequencies / self.frequency - 1)
-        return int(np.argmin(apart)) if np.min(apart) <= within else None
+        return min(np.flatnonzero(apart <= within).tolist(), key=apart.__getitem__, default=None)
 
     def at(self, level: float) -> tuple[float, float]:
         """Frequency, Hz, and damping ratio at a level, m/s²."""

@@ -222,9 +222,8 @@ class Structure:
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Structure:
         """Structure from a dictionary that `to_tree` made, exact to the bit."""
-        beyond = tree.get("residual")  # structures of before have none
-        residual = None if beyond is None else ResidualModes(**beyond)
-        laws = laws_from_tree(tree.get("laws"))
+        residual = tree["residual"] and ResidualModes(**tree["residual"])
+        laws = laws_from_tree(tree["laws"])
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual, "laws": laws})
 
     @property

@@ -258,11 +258,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     if not context.modal.laws:
         sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
-    for law in context.modal.laws:
-        nearest = law.mode_among(context.end.structure.natural_frequencies, 0.25)
-        if nearest is None:  # no mode of the answer follows it: `judge` tells it
-            continue
-        mode, (low, high) = nearest + 1, law.levels
+    frequencies = context.end.structure.natural_frequencies
+    near = [(law, law.mode_among(frequencies, 0.25)) for law in context.modal.laws]
+    for law, mode in ((law, k + 1) for law, k in near if k is not None):  # `judge` tells of the others
+        low, high = law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
         numbers |= {"change of frequency": f, "its deviation": std, "change of damping": zeta}
