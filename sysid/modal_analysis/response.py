@@ -92,17 +92,12 @@ def residual(
     """
     u_re, u_im = parts_of(test.base)
     q_re, q_im = modal_motion(test.base, gamma, modal_gains(omega, ratios, test.freq, shift))
-    a_re, a_im = parts_of(test.relative)
-    misfits = [(phi @ q_re - a_re, phi @ q_im - a_im)]
-    if test.force is not None:
-        f_re, f_im = parts_of(test.force)
-        misfits.append(
-            tuple(gamma.T @ q + rigid_body_mass @ u - f for q, u, f in ((q_re, u_re, f_re), (q_im, u_im, f_im)))
-        )
+    force = gamma.T @ q_re + rigid_body_mass @ u_re, gamma.T @ q_im + rigid_body_mass @ u_im
+    every = zip(records_of(test), weights_of_test(test, weighted=weighted), strict=True)
     pieces = [
-        ca.DM(weight / scale) * part
-        for parts, (weight, scale) in zip(misfits, weights_of_test(test, weighted=weighted), strict=True)
-        for part in parts
+        ca.DM(weight / scale) * (predicted - recorded)
+        for parts, ((record, _), (weight, scale)) in zip(((phi @ q_re, phi @ q_im), force), every, strict=False)
+        for predicted, recorded in zip(parts, parts_of(record), strict=True)
     ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
