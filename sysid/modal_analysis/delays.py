@@ -206,9 +206,9 @@ def _joined(test: Measurement) -> Measurement:
         if force_std is None:
             force_std = np.full(test.force.shape, np.sqrt(np.mean(np.abs(test.force) ** 2)))
         std = np.concatenate([std, force_std], axis=1)
-    response = np.concatenate([test.response, test.force], axis=1)
+    outputs = test.outputs
     return replace(
-        test, response=response, rigid_body=np.zeros((response.shape[1], test.n_base)), sensors=None,
+        test, response=outputs, rigid_body=np.zeros((outputs.shape[1], test.n_base)), sensors=None,
         response_std=std, force=None, force_std=None, gain_std=None,
     )  # fmt: skip
 
