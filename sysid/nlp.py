@@ -91,37 +91,42 @@ def product(one: ca.MX, other: ca.MX) -> ca.MX:
 
 
 class NumpyFunction(ca.Callback):
-    """A function of one column that NumPy computes, as CasADi calls it: of its size to values of these shapes.
+    """A function that NumPy computes, as CasADi calls it: of a column and other matrices, to matrices.
 
-    It must live as long as what calls it: CasADi holds no Python object.
+    It must live as long as what calls it: CasADi holds no Python object, and takes Ctrl-C for an error (`interrupt`).
     """
 
     def __init__(
-        self, size: int, shapes: Sequence[tuple[int, int]], call: Callable[[Array], Sequence[Array | float]]
+        self, call: Callable[..., Sequence[Any]], inputs: Sequence[ca.Sparsity], outputs: Sequence[ca.Sparsity]
     ) -> None:
         ca.Callback.__init__(self)
-        self.size, self.shapes, self.values = size, shapes, call
+        self.call_numpy, self.inputs, self.outputs = call, inputs, outputs
+        self.interrupt: KeyboardInterrupt | None = None
         self.construct("by_numpy", {})
 
     def get_n_in(self) -> int:
-        """One column."""
-        return 1
+        """Number of inputs."""
+        return len(self.inputs)
 
     def get_n_out(self) -> int:
-        """As many values as there are shapes."""
-        return len(self.shapes)
+        """Number of outputs."""
+        return len(self.outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of the column."""
-        return ca.Sparsity.dense(self.size, 1)
+        """Pattern of an input."""
+        return self.inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of a value."""
-        return ca.Sparsity.dense(*self.shapes[i])
+        """Pattern of an output."""
+        return self.outputs[i]
 
     def eval(self, arg: list) -> list:
-        """Values at a column."""
-        return [*self.values(np.asarray(arg[0]).ravel())]
+        """Values at a column, which NumPy is given as an array."""
+        try:
+            return [*self.call_numpy(np.asarray(arg[0]).ravel(), *arg[1:])]
+        except KeyboardInterrupt as interrupt:
+            self.interrupt = interrupt
+            raise
 
 
 class NonlinearProgram:
@@ -336,7 +341,11 @@ class IterationMonitor:
     def callback(self, start: Array, n_constraints: int) -> ca.Callback:
         """The callback that `nlpsol` calls after each iteration."""
         self.z = start
-        return _IterationCallback(self, start.size, n_constraints)
+        n = start.size
+        sizes = {"x": n, "f": 1, "g": n_constraints, "lam_x": n, "lam_g": n_constraints, "lam_p": 0}
+        inputs = [ca.Sparsity.dense(sizes[ca.nlpsol_out(i)]) for i in range(ca.nlpsol_n_out())]
+        # A nonzero answer stops IPOPT.
+        return NumpyFunction(lambda z, f, *_: [int(self.record(z, float(f)))], inputs, [ca.Sparsity.dense(1)])
 
     def record(self, z: Array, objective: float) -> bool:
         """Record an iterate; whether to stop."""
@@ -348,29 +357,3 @@ class IterationMonitor:
         except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
             self.stopped = error
         return self.stopped is not None or self.is_over or self.stands_still
-
-
-class _IterationCallback(ca.Callback):
-    """CasADi's shape of an iteration callback."""
-
-    def __init__(self, monitor: IterationMonitor, n: int, n_constraints: int) -> None:
-        ca.Callback.__init__(self)
-        self.monitor = monitor
-        self.sizes = {"x": n, "f": 1, "g": n_constraints, "lam_x": n, "lam_g": n_constraints, "lam_p": 0}
-        self.construct("iteration", {})
-
-    def get_n_in(self) -> int:
-        """Count the outputs of an nlpsol."""
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        """Give one flag."""
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shapes of the nlpsol outputs."""
-        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
-
-    def eval(self, arg: list) -> list:
-        """Hand the iterate on; a nonzero answer stops IPOPT."""
-        return [int(self.monitor.record(np.asarray(arg[0]).ravel(), float(arg[1])))]

@@ -18,7 +18,7 @@ import numpy as np
 from sysid.assessment.cone import Cone, Pairs, forms, null_space, unknowns
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import NoiseLevels
+from sysid.measurement.whole import NoiseLevels, raised
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, residual_share
@@ -315,11 +315,11 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     Where it is, an amplitude counts by the noise at its own lines, and `_RESOLVED` of its standard deviations will do;
     where the misfit is larger than that noise, so is what may look like a mode.
     """
-    if std is not None and np.any(std):
-        weight = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
+    if (std := raised(std)) is not None:
+        weight = 1 / std
         error = (record - predicted) * weight
         size, left = float(np.linalg.norm(record * weight)), float(np.linalg.norm(error))
-        more = max(1.0, left / np.sqrt(np.count_nonzero(weight)) / _AS_STATED)
+        more = max(1.0, left / np.sqrt(weight.size) / _AS_STATED)
         if more > 1:  # what a model misses neighbouring lines share
             more *= np.sqrt(line_correlation(error.swapaxes(0, 1)))
         return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))

@@ -313,9 +313,9 @@ def moves_by_records(
             (A, B), scattered = uneven, np.inf
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns, scattered)
-    plain = normals if B is None else spread(A, None, path)[0]
-    shifts = np.zeros((index.size, 0))
-    if gains or modal.calibration is not None:
+    shifts, gains = np.zeros((index.size, 0)), gains or modal.calibration is not None
+    plain = normals if B is None or not (gains or test.window) else spread(A, None, path)[0]
+    if gains:
         if spectra is not None:
             direct = [test.rigid_body, structure.rigid_body_mass]
             pulls = gain_gradients(modes, index, direct, [record.grams(spectra) for record in records])

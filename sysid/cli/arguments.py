@@ -137,43 +137,34 @@ def _add_run(command: Adder) -> None:
     _add_test_options(run)
     _add_modal_options(run)
     run.add_argument(
-        "--seed",
-        type=_seed,
-        metavar="N",
+        "--seed", type=_seed, metavar="N",
         help="of the search, 0 by default: the same seed gives the same result. The simulated noise of a problem is "
         "part of the problem and does not change with it",
-    )
+    )  # fmt: skip
     run.add_argument(
-        "--strategy",
-        choices=("auto", *NAMED),
-        metavar="S",
+        "--strategy", choices=("auto", *NAMED), metavar="S",
         help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "
         "structured models and variables of your own; swarm: the particle swarm and its refinement; hpso-ls: the "
         "published swarm, eigenvalue refinement and IPOPT in Cholesky coordinates; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
-    )
+    )  # fmt: skip
     run.add_argument(
-        "--refine-by",
-        choices=get_args(RefineBy),
-        metavar="WAY",
+        "--refine-by", choices=get_args(RefineBy), metavar="WAY",
         help="how swarm and hpso-ls give a candidate the measured frequencies: closed-form (swarm by default), the "
         "nearest matrix; ipopt, the paper's nonlinear programme for every candidate, for small problems; leaders "
         "(hpso-ls by default), the closed form, and IPOPT for each new leader of the swarm",
-    )
+    )  # fmt: skip
     run.add_argument(
         "--out", metavar="DIR", help="folder of the results, results/NAME by default; one run at a time writes there"
     )
     run.add_argument(
-        "--max-time",
-        type=_seconds,
-        metavar="S",
+        "--max-time", type=_seconds, metavar="S",
         help="end after about so many seconds; a report that they do not suffice for is left to 'sysid report'",
-    )
+    )  # fmt: skip
     run.add_argument(
-        "--resume",
-        metavar="DIR",
+        "--resume", metavar="DIR",
         help="go on with the killed or interrupted run in this folder; a PROBLEM that is not bundled is said again",
-    )
+    )  # fmt: skip
     _add_trust(run, "the unfinished run")
     run.add_argument("--fresh", action="store_true", help="begin anew where there is an unfinished run in the folder")
 
@@ -181,20 +172,16 @@ def _add_run(command: Adder) -> None:
 def _add_test_options(run: argparse.ArgumentParser) -> None:
     """Add what may be said of a test file: masses, lines that are fitted, and what is near enough."""
     run.add_argument(
-        "--mass",
-        type=_masses,
-        metavar="KG",
+        "--mass", type=_masses, metavar="KG",
         help="of TEST.h5: mass of the structure, kg, a number or one a direction: 1450 or 1450,1450,1450; with "
         "--lumped that at the sensors alone, without what moves with the table (adapter, base ring)",
-    )
+    )  # fmt: skip
     run.add_argument("--lumped", action="store_true", default=None, help="of TEST.h5: masses at the sensors alone")
     run.add_argument(
-        "--band",
-        type=_band,
-        metavar="LOW-HIGH",
+        "--band", type=_band, metavar="LOW-HIGH",
         help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40; those that the base excites, of records in "
         "time, unless given",
-    )
+    )  # fmt: skip
     run.add_argument(
         "--goal", type=float, metavar="SHARE",
         help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
@@ -238,10 +225,9 @@ def _add_compare(command: Adder) -> None:
     _add_modal_options(compare)
     compare.add_argument("--seed", type=_seed, default=0, metavar="N", help="of all methods, 0 by default")
     compare.add_argument(
-        "--out",
-        metavar="DIR",
+        "--out", metavar="DIR",
         help="folder of the picture, results/NAME by default; the table goes there too (CSV, JSON)",
-    )
+    )  # fmt: skip
     compare.add_argument("--max-time", type=_seconds, metavar="S", help="end each method after about so many seconds")
 
 
@@ -264,29 +250,21 @@ def _add_read(command: Adder) -> None:
     read.add_argument("--out", metavar="TEST.h5", help="file to write, test.h5 by default")
     read.add_argument("--sensors", metavar="TOML", help="which column is which sensor")
     read.add_argument(
-        "--sensor",
-        action="append",
-        nargs="+",
-        default=[],
-        metavar=("COLUMN", "KEY=VALUE"),
+        "--sensor", action="append", nargs="+", default=[], metavar=("COLUMN", "KEY=VALUE"),
         help="one sensor: role=base|response|force axis=x position=0,0,3 unit=g gain=0.995 delay=0.002 part=A name=B",
-    )
+    )  # fmt: skip
     read.add_argument("--rate", type=float, metavar="HZ", help="samples a second, where no column has the time")
     read.add_argument("--time", metavar="COLUMN", help="the column of time")
     read.add_argument("--frequency", metavar="COLUMN", help="the column of frequencies, of spectra")
     read.add_argument(
-        "--join",
-        action="store_true",
-        default=None,
+        "--join", action="store_true", default=None,
         help="each file has one sensor: the files of a folder, or those that share the rest of their names (run1_top, "
         "run1_table), are one run; columns are called FILE, or FILE.COLUMN of several",
-    )
+    )  # fmt: skip
     read.add_argument(
-        "--align",
-        action="store_true",
-        default=None,
+        "--align", action="store_true", default=None,
         help="files of a run that have clocks of their own are brought to that of the base by the motion they share",
-    )
+    )  # fmt: skip
     read.add_argument("--base-axes", metavar="AXES", help='along which the base moves, such as "x" or "x rz"')
     read.add_argument("--frf", metavar="FORM", help="of frequency responses: transmissibility, accelerance, mobility, "
                       "receptance, apparent mass")  # fmt: skip
@@ -315,10 +293,9 @@ def _add_refine(command: Adder) -> None:
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
     refine.add_argument(
-        "--module",
-        metavar="FILE",
+        "--module", metavar="FILE",
         help="the problem module of RESULT, in the place of the one that RESULT names; a bundled one need not be named",
-    )
+    )  # fmt: skip
     _add_trust(refine, "RESULT")
     _add_kinds(refine)
     refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
@@ -330,44 +307,32 @@ def _add_kinds(refine: argparse.ArgumentParser) -> None:
     """Add the kinds of jobs, of which one is asked for."""
     kinds = refine.add_mutually_exclusive_group()
     kinds.add_argument(
-        "--starts",
-        type=_count,
-        metavar="N",
+        "--starts", type=_count, metavar="N",
         help="16 by default; the first is the result. Tells the distinct minima, and how often each was reached",
-    )
+    )  # fmt: skip
     kinds.add_argument(
-        "--draws",
-        type=functools.partial(_whole, 2),
-        metavar="N",
+        "--draws", type=functools.partial(_whole, 2), metavar="N",
         help="fits of N sets of records that the result would have given, with noise drawn anew: their spread beside "
         "the linear uncertainty; an answer in the band, or with coupled damping, is identified anew from each",
-    )
+    )  # fmt: skip
     kinds.add_argument(
-        "--leave-out",
-        choices=("run", "sensor"),
+        "--leave-out", choices=("run", "sensor"),
         help="identify without each run, or each sensor, in turn: how far the answer moves, and how well it predicts "
         "what was left out",
-    )
+    )  # fmt: skip
     kinds.add_argument(
-        "--bands",
-        type=_band,
-        nargs="+",
-        metavar="LOW-HIGH",
+        "--bands", type=_band, nargs="+", metavar="LOW-HIGH",
         help="identify from the lines of each band, in Hz: how far the answer moves with the band",
-    )
+    )  # fmt: skip
     kinds.add_argument(
-        "--orders",
-        type=_orders,
-        metavar="A-B",
+        "--orders", type=_orders, metavar="A-B",
         help="identify with A to B modes of those that stand out of the noise, where mass and stiffness are free: AIC, "
         "BIC and the residual of the validation tests",
-    )
+    )  # fmt: skip
     kinds.add_argument(
-        "--variants",
-        nargs="+",
-        metavar="MODULE",
+        "--variants", nargs="+", metavar="MODULE",
         help="identify by other problem modules from the same data: AIC, BIC and the residual of the validation tests",
-    )
+    )  # fmt: skip
 
 
 def _add_report(command: Adder) -> None:
@@ -402,43 +367,35 @@ def _add_export(command: Adder) -> None:
 def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
     """Give a command the problem module, which may be `optional`, and what is handed on to it."""
     command.add_argument(
-        "problem",
-        metavar="PROBLEM",
-        nargs="?" if optional else None,
+        "problem", metavar="PROBLEM", nargs="?" if optional else None,
         help="a path to a module (.py), else a module in ./problems, else a bundled problem, else a dotted module",
-    )
+    )  # fmt: skip
     command.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
     command.set_defaults(modes=None, dofs=())
     command.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="settings",
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
         help="a keyword parameter of the module's problem(), such as elements=3: a number, a list or what else Python "
         "can read, else a text; may be given several times",
-    )
+    )  # fmt: skip
 
 
 def _add_trust(command: argparse.ArgumentParser, of: str) -> None:
     """Give a command ``--trust``; `of` is the file that names a module."""
     command.add_argument(
-        TRUST,
-        action="store_true",
+        TRUST, action="store_true",
         help=f"run the problem module that {of} names, with your rights on this machine: its code may do anything, so "
         "say this of files of your own alone. Problems that come with the package need it not",
-    )
+    )  # fmt: skip
 
 
 def _add_result(command: argparse.ArgumentParser) -> None:
     """Add RESULT and ``--module``."""
     command.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     command.add_argument(
-        "--module",
-        metavar="FILE",
+        "--module", metavar="FILE",
         help="the problem module that RESULT was made by, which is run: where RESULT does not hold all of its problem, "
         "and more is wanted than figures, report and matrices, which it always holds",
-    )
+    )  # fmt: skip
 
 
 def _band(text: str) -> tuple[float, float]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from sysid import catalogue
 from sysid.assessment.determination import determine
-from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
+from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity, system_matrices
 from sysid.cli.output import Output
 from sysid.cli.read import tell_channels
 from sysid.cli.requests import is_test, recipe_of
@@ -29,6 +29,7 @@ from sysid.files import recorded_test
 from sysid.finding import MOST_OF_A_KIND
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.response import states_noise
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
 from sysid.problem.direct_response import Slopes, slopes_of
@@ -133,7 +134,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
 def _records(test: Measurement) -> str:
     names = test.sensor_names
     force = "no base force" if test.force is None else "with base force"
-    noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
+    noise = "noise stated" if states_noise(test) else "no noise stated"
     runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
         f"{counted(len(names), 'sensor')} ({listed(names)}), base moving along {axes}, {runs}, "
@@ -381,8 +382,7 @@ def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
 def _moved_matrices(point: _Point) -> tuple[int, int]:
     """Numbers of unseen directions that move M_SS, K_SS or C, and of the rest that move the base's blocks."""
     s, steps = point.slopes, point.known.unit[:, None] * point.known.unseen
-    n = s.structure.n
-    M, K, C = s.structure.mass[:n, :n], s.structure.stiffness[:n, :n], s.structure.damping
+    M, K, C = system_matrices(s.structure)
 
     def moved(slope: Array, size: Array) -> Array:
         return ((slope @ steps) / size[..., None]).reshape(-1, steps.shape[1])
@@ -422,11 +422,7 @@ def _moves(problem: Prepared, point: _Point) -> Array:
 def _all_stated(problem: Prepared) -> bool:
     """True where every record that is fitted states its noise."""
     formulation = problem.formulation
-    return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)
-
-
-def _noise_is_stated(test: Measurement) -> bool:
-    return test.response_std is not None and (test.force is None or test.force_std is not None)
+    return formulation.fits_records and all(states_noise(term.test) for term in formulation.tests)
 
 
 def _with_noise(test: Measurement) -> Measurement:

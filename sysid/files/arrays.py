@@ -127,7 +127,8 @@ def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording
         Where there are no vectors; a square matrix, which does not tell whether its channels are rows or columns.
     """
     numbers = {name: (np.squeeze(one), unit) for name, (one, unit) in named.items() if one.dtype.kind in "buifc"}
-    scalars = {name: float(one) for name, (one, _) in numbers.items() if one.ndim == 0 and one.dtype.kind != "c"}
+    real = [(name, one) for name, (one, _) in numbers.items() if one.ndim == 0 and one.dtype.kind != "c"]
+    scalars = [(name.rpartition(".")[2].lower(), float(one)) for name, one in real]
     lengths = {one.size for name, (one, _) in numbers.items() if one.ndim == 1 and is_abscissa(name)}
     vectors: dict[str, tuple[Any, str]] = {}
     remarks = []
@@ -145,10 +146,9 @@ def _recordings(path: Path, named: dict[str, tuple[Any, str]]) -> list[Recording
     refuse((square is not None, f"{path}: array {square!r} {words}"))
     other = [name for name, (one, _) in vectors.items() if one.size != length]
     remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
-    rates = [value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES]
+    rates = [value for word, value in scalars if word in _RATES]
     if not any(np.iscomplexobj(one) for one, _ in vectors.values()):  # functions have steps of frequency
-        steps = (value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _STEPS)
-        rates += [1 / value for value in steps if value > 0]
+        rates += [1 / value for word, value in scalars if word in _STEPS and value > 0]
     columns = tuple(
         Column(name, one, unit, f"array {name!r}") for name, (one, unit) in vectors.items() if name not in other
     )

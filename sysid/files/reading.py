@@ -28,9 +28,7 @@ _READERS: dict[str, Callable[[Path], list[Recording]]] = {
 
 
 def read(
-    paths: str | Path | Sequence[str | Path],
-    sensors: str | Path | Mapping[str, Any] | None = None,
-    **options: Any,
+    paths: str | Path | Sequence[str | Path], sensors: str | Path | Mapping[str, Any] | None = None, **options: Any
 ) -> Measurement:
     """A test from the files of a logger.
 

@@ -272,9 +272,8 @@ def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.rando
     """The test with the records that the structure makes, and noise of the same size."""
     inflation = inflation_of(test, noise_records(test, structure, unknowns), unknowns)
     more = inflation if np.isfinite(inflation) else 1.0
-    response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
-    other = replace(test, response=test.response + response)
-    return other if test.force is None else replace(other, force=test.force + force[0])
+    taken = [misfit - _noise(more * std, rng) for misfit, std in misfits_of(test, structure, unknowns)]
+    return test.less(np.concatenate(taken, axis=1))
 
 
 def _whole_again(modal: ModalEstimate, structure: Structure, rng: np.random.Generator) -> Measurement:

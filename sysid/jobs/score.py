@@ -13,6 +13,7 @@ from sysid.assessment.sensitivity import sensitivity
 from sysid.measurement.whole import raised
 from sysid.modal_analysis import outliers
 from sysid.modal_analysis.pole_functions import unit_columns
+from sysid.modal_analysis.response import misfits, states_noise
 from sysid.results.identification import Identification
 from sysid.results.tables import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.structure.structure import Array, ComplexArray
@@ -233,11 +234,8 @@ def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, fl
     unfitted = [] if problem.formulation.fits_records else [(problem.modal[0], result.structure)]
     for modal, structure in unfitted + fits:
         test = modal.records
-        parts = [(test.relative - test.predict(structure), test.response_std)]
-        if test.force is not None:
-            parts.append((test.force - test.predict_force(structure), test.force_std))
-        weighed = [_over(misfit, std, test.own_lines) for misfit, std in parts]
-        if all(std is not None for _, std in parts):
+        weighed = [_over(misfit, std, test.own_lines) for misfit, std in misfits(test, structure)]
+        if states_noise(test):
             yield np.concatenate([e for e, _ in weighed]), sum(log_std for _, log_std in weighed)
         else:
             yield from weighed

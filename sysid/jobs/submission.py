@@ -225,10 +225,7 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
     wrong = [type(change).__name__ for change in changes if not isinstance(change, Change | None)]
     refuse(
         (wrong, f"changes holds a {', '.join(wrong[:1])}; give Band, WithoutRun, WithoutSensor or NumberOfModes"),
-        (
-            others and (changes or strategy),
-            "give changes or a strategy without starts, and changes without draws",
-        ),
+        (others and (changes or strategy), "give changes or a strategy without starts, and changes without draws"),
         (strategy not in ("", "auto", *NAMED), f"strategy {strategy!r} is unknown; give one of {NAMES}"),
     )
     return strategy or ("auto" if changes else "")

@@ -93,15 +93,6 @@ class DamagedChannel:
             return "the run is cut there, and what is damaged left out"
         return _REMEDIES.get(self.kind, "leave this channel out, cut the record there, or record it anew")
 
-    def to_tree(self) -> dict[str, Any]:
-        """Give the fields by their names; `from_tree` takes them back."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_tree(cls, tree: dict[str, Any]) -> DamagedChannel:
-        """Give what a tree of `to_tree` stands for."""
-        return cls(**tree)
-
 
 @dataclass(frozen=True, eq=False)
 class SoundRuns:

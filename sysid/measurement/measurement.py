@@ -9,16 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import (
-    InputError,
-    as_float,
-    check_frequencies,
-    choice,
-    numbers,
-    refuse,
-    sequence,
-    whole_number,
-)
+from sysid.errors import InputError, as_float, check_frequencies, choice, numbers, refuse, sequence, whole_number
 from sysid.measurement import spectra
 from sysid.measurement.damaged_runs import DamagedChannel, names_of_channels, sound_runs
 from sysid.measurement.spectra import FORCE_NEEDED, Missing, checked_deviations, checked_lines, complete, named, present
@@ -59,7 +50,8 @@ class Measurement:
         Force of the base on the structure, N (N m): it tends to ``+M_rb u0''`` at low frequency.
     sensors : sequence of Sensor, optional
     response_std, force_std : array_like, optional
-        Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records.
+        Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records. The median stands for
+        zeros among others.
     base_axes : str or sequence of str, optional
         Names of the base directions (see `sysid.rigid_body`); by default those that the sensors' axes tell, else
         x y z rx ry rz in this order. Needed where fewer than four directions hold a rotation.
@@ -169,12 +161,11 @@ class Measurement:
         return {
             "freq": self.freq, "base": self.base, "response": self.response, "rigid_body": self.rigid_body,
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
-            "force_std": self.force_std, "base_axes": self.base_axes,
-            "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
+            "force_std": self.force_std, "base_axes": self.base_axes, "dropped": self.dropped,
+            "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
             "averaged": self.averaged, "window": self.window, "whole": self.whole and self.whole.to_tree(),
             "sample_rate": self.sample_rate, "gain_std": self.gain_std, "base_gain_std": self.base_gain_std,
-            "force_gain_std": self.force_gain_std,
-            "damage": [one.to_tree() for one in self.damage],
+            "force_gain_std": self.force_gain_std, "damage": [dict(vars(one)) for one in self.damage],
             "base_sensors": [one._asdict() for one in self.base_sensors],
         }  # fmt: skip
 
@@ -183,7 +174,7 @@ class Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
         whole = tree["whole"] and WholeRecords.from_tree(tree["whole"])
-        damage = tuple(map(DamagedChannel.from_tree, tree.get("damage", ())))
+        damage = tuple(DamagedChannel(**one) for one in tree.get("damage", ()))
         given = {"sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole, "damage": damage}
         given["base_sensors"] = tuple(BaseSensor(**one) for one in tree.get("base_sensors", ()))
         return cls(**{**tree, **given})
@@ -237,6 +228,11 @@ class Measurement:
         for at, run in enumerate(self.whole.moving):
             ends[run, 2 * at : 2 * at + 2] = self.own_lines[run] * self.whole.transients(self.freq)
         return np.concatenate([self.base, ends], axis=1)
+
+    @property
+    def outputs(self) -> ComplexArray:
+        """Responses and, where they were measured, forces, (runs, channels, n_freq)."""
+        return self.response if self.force is None else np.concatenate([self.response, self.force], axis=1)
 
     @property
     def is_in_time(self) -> bool:
@@ -318,6 +314,11 @@ class Measurement:
         runs: Any = {name: getattr(self, name)[keep] for name in _RECORDS[1:] if getattr(self, name) is not None}
         some = replace(self, whole=self.whole and self.whole.of_runs(keep), **runs)
         return some.at(np.any(some.own_lines, axis=0))
+
+    def less(self, taken: ComplexArray, **changes: Any) -> Measurement:
+        """The test with this taken off its `outputs`, and other changes of its fields."""
+        response, *force = np.split(self.outputs - taken, [self.n_sensors], axis=1)
+        return replace(self, response=response, force=None if self.force is None else force[0], **changes)
 
     def of_sensors(self, keep: NDArray[np.bool_]) -> Measurement:
         """The sensors where `keep`, (n_sensors,), is true."""
@@ -482,8 +483,8 @@ class Measurement:
         if band is None and estimator == "records":
             band = test.freq[0], max(spectra.FOLDED * sample_rate, test.freq[0])
         test = test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
-        parts = (test.base, test.response, *([] if test.force is None else [test.force]))
-        return replace(test, whole=test.whole and with_steady_tones(test.whole, test.freq, test.own_lines, *parts))
+        of_tones = test.freq, test.own_lines, test.base, test.outputs
+        return replace(test, whole=test.whole and with_steady_tones(test.whole, *of_tones))
 
     noise_from_rest = staticmethod(levels_at_rest)
 

@@ -190,12 +190,7 @@ def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment:
     n = runs[0].response.shape[0]
     force, force_std = (None, None) if runs[0].force is None else (frf[n:], frf_std[n:])
     return Estimate(
-        freq=freq,
-        frf=frf[:n],
-        frf_std=frf_std[:n],
-        force=force,
-        force_std=force_std,
-        coherence=coherence[:, :n].T,
+        freq=freq, frf=frf[:n], frf_std=frf_std[:n], force=force, force_std=force_std, coherence=coherence[:, :n].T
     )
 
 
@@ -438,7 +433,10 @@ def checked_lines(name: str, value: Any, n_freq: int, read: Callable[..., Any] =
 def checked_deviations(
     name: str, value: Any, record: ComplexArray | None, read: Callable[..., Any] = complete
 ) -> Array | None:
-    """Deviations of a record, of its shape; None where none are given."""
+    """Deviations of a record, of its shape; None where none are given.
+
+    A zero among others, as of a function that is zero at a line, tells no noise: the median stands in its place.
+    """
     if value is None:
         return None
     if record is None:
@@ -450,4 +448,4 @@ def checked_deviations(
         raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
-    return full
+    return np.where(full == 0, np.median(full[full > 0].tolist() or [0.0]), full)

@@ -20,7 +20,9 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance
 
 
-def with_steady_tones(whole: WholeRecords, freq: Array, own: NDArray[np.bool_], *records: ComplexArray) -> WholeRecords:
+def with_steady_tones(
+    whole: WholeRecords, freq: Array, own: NDArray[np.bool_], base: ComplexArray, outputs: ComplexArray
+) -> WholeRecords:
     """Whole records with the tones that they hold: `WholeRecords.tones`.
 
     Parameters
@@ -28,13 +30,11 @@ def with_steady_tones(whole: WholeRecords, freq: Array, own: NDArray[np.bool_], 
     whole : WholeRecords
     freq, own : (n_freq,), (runs, n_freq)
         Hz, and which lines each run has.
-    records : (runs, channels, n_freq)
-        Base, responses and perhaps forces.
+    base, outputs : (runs, channels, n_freq)
     """
     tones: list[float] = []
     for run, at in enumerate(own):
-        base, *outputs = (part[run][:, at] for part in records)
-        for tone in _tones(freq[at], base, np.vstack(outputs)):
+        for tone in _tones(freq[at], base[run][:, at], outputs[run][:, at]):
             tones += [tone] if all(abs(tone - one) > whole.spacing.max() / 2 for one in tones) else []
     return replace(whole, tones=tuple(tones))
 

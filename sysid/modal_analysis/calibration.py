@@ -81,10 +81,6 @@ class Calibration:
         lam, V = np.linalg.eigh(self.covariance)
         return np.asarray(V * np.sqrt(np.maximum(lam, 0.0)))
 
-    def to_tree(self) -> dict[str, Any]:
-        """Give the fields by their names; `stored_calibrations` takes them back."""
-        return {"tolerance": self.tolerance, "values": self.values, "covariance": self.covariance}
-
 
 def calibrated(test: Measurement, calibration: Calibration | None) -> Measurement:
     """The test without errors of its gains; as it is where all are exact."""

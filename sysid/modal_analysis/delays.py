@@ -25,6 +25,7 @@ from sysid.measurement.whole import factors_of_runs
 from sysid.modal_analysis.direct_terms import (
     MOST_DAMPED,
     BesidePoles,
+    BesideTerms,
     beside_poles,
     beside_poles_at,
     telling_lines,
@@ -82,13 +83,9 @@ class Delays:
         values[told], std[told] = self.values, self.std
         return Delays(values, std, self.of_base)
 
-    def to_tree(self) -> dict[str, Any]:
-        """Give the fields by their names; `from_tree` takes them back."""
-        return {"values": self.values, "std": self.std, "of_base": self.of_base}
-
     @classmethod
     def from_tree(cls, tree: dict[str, Any], test: Measurement) -> Delays:
-        """Give those of a test that `to_tree` made a tree of; refused where they are of another."""
+        """Those of a test with these fields; refused where they are of another."""
         found, shape = cls(**tree), cls.none(test).values.shape
         parts = found.values, found.std
         sound = all(isinstance(one, np.ndarray) and one.shape == shape and np.all(np.isfinite(one)) for one in parts)
@@ -98,9 +95,8 @@ class Delays:
 
 def stored_delays(tree: dict[str, Any], tests: Sequence[Measurement]) -> list[Delays]:
     """Delays of the tests of a stored problem; results of before hold none."""
-    none = [Delays.none(test).to_tree() for test in tests]
-    found = zip(tree.get("delays") or none, none, tests, strict=False)
-    return [Delays.from_tree(one or other, test) for one, other, test in found]
+    given = zip(tree.get("delays") or [None] * len(tests), tests, strict=False)
+    return [Delays.none(test) if one is None else Delays.from_tree(one, test) for one, test in given]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,14 +206,14 @@ def _joined(test: Measurement) -> Measurement:
         if force_std is None:
             force_std = np.full(test.force.shape, np.sqrt(np.mean(np.abs(test.force) ** 2)))
         std = np.concatenate([std, force_std], axis=1)
-    response = np.concatenate([test.response, test.force], axis=1)
+    outputs = test.outputs
     return replace(
-        test, response=response, rigid_body=np.zeros((response.shape[1], test.n_base)), sensors=None,
+        test, response=outputs, rigid_body=np.zeros((outputs.shape[1], test.n_base)), sensors=None,
         response_std=std, force=None, force_std=None, gain_std=None,
     )  # fmt: skip
 
 
-class _Late:
+class _Late(BesideTerms):
     """Channels without their delays, fitted on poles, residues and terms without; what is left tells of the delays.
 
     The terms are 1, and w² and i w³ of modes above the lines and of their damping. With `rising` a term ``i w`` too,
@@ -238,25 +234,12 @@ class _Late:
         self, still: Measurement, clocks: NDArray[np.intp], delays: Array, poles: Array,
         complex_residues: bool = False, *, rising: bool = False,
     ) -> None:  # fmt: skip
-        self.still, self.clocks, self.delays, self.poles = still, clocks, delays, poles
-        self.complex_residues = complex_residues
-        self.omega, self.ratios = np.exp(poles.reshape(2, -1))
+        self.still, self.clocks, self.delays, self.complex_residues = still, clocks, delays, complex_residues
         self.test = test = without_delays(still, delays[clocks])
-        self.records = records = Records(test)
-        x = 1j * test.freq / test.freq[-1]
+        records, x = Records(test), 1j * test.freq / test.freq[-1]
         direct = records.basis(np.stack([x**0, x**2, x**3, x])[: 3 + rising], records.driven)
-        functions = records.functions(self.omega, self.ratios, velocity=complex_residues)
-        direct = np.hstack([direct, _of_runs(test, records)])
-        self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
-        answered = self.basis.answers(records.data)
-        self.left = records.data - self.basis.times(answered)
-        beta = np.linalg.pinv(R, rcond=ROUND_OFF) @ answered / size[:, None]
-        of_poles = len(R) - functions.shared.shape[1]  # behind those of one run each, and those without poles
-        residues = functions.in_order([beta[: of_poles - direct.shape[1]], beta[of_poles:]])
-        self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
-        self.unknowns = len(R) * self.left.shape[1]
-        least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
-        self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+        super().__init__(records, poles, np.hstack([direct, _of_runs(test, records)]), velocity=complex_residues)
+        self.unknowns = self.count * self.left.shape[1]
 
     def moved(self, poles: Array, delays: Array) -> _Late:
         """The fit after a step, in which no pole becomes one that answers like a term without poles."""

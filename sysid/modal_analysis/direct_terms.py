@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import blurred
+from sysid.measurement.whole import raised
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.pole_functions import orthonormal
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.response import states_noise
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations, steady_sine
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
@@ -146,7 +148,7 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
     even = np.allclose(test.freq / spacing, np.round(test.freq / spacing), atol=0.01)
     turned = test = replace(test, window="taken off")
     lefts: list[float] = []
-    last, rest = np.zeros(1), np.zeros(1)
+    last, rest = np.zeros(1), blurred(test.outputs)
     try:
         for _ in range(rounds if even and test.has_unit_runs else 0):
             beside = beside_poles(turned)
@@ -154,20 +156,17 @@ def without_window(test: Measurement, rounds: int = 12, near: float = 0.1) -> Me
                 break
             wide = beside.at.ratios * beside.at.omega > np.pi * spacing
             (off, narrow), left = _by_window(turned, beside.at.omega, beside.at.ratios, wide, spacing)
-            force = None if test.force is None else test.force - off[:, test.n_sensors :]
-            before, turned = turned, replace(test, response=test.response - off[:, : test.n_sensors], force=force)
+            before, turned = turned, test.less(off)
             size = 1e-3 * np.abs(test.response) if test.response_std is None else test.response_std
             lefts, rest, last = [*lefts, left], np.abs(narrow) + np.abs(off - last), off
             if np.all(np.abs(turned.response - before.response) < near * size):
                 break
     except (InputError, np.linalg.LinAlgError):
         lefts = []
-    channels = test.n_sensors + (0 if test.force is None else test.n_base)
-    stated = test.response_std is not None and (test.force is None or test.force_std is not None)
-    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 if stated else 0.0
+    channels = test.outputs.shape[1]
+    chance = beyond_chance(2 * test.n_runs * (channels + 1)) / 2 * states_noise(test)
     if not lefts or lefts[-1] - lefts[0] > chance:
-        rest = np.concatenate([blurred(H) for H in (test.response, test.force) if H is not None], axis=1)
-        turned = replace(test, window="")
+        rest, turned = blurred(test.outputs), replace(test, window="")
     of_response, of_force = np.split(np.abs(rest), [test.n_sensors], axis=1)
     of_window = [
         None if std is None else np.hypot(std, error)
@@ -183,8 +182,8 @@ def _by_window(
 
     And the sum of squares that the residues at all poles leave, in units of the noise.
     """
-    every = np.concatenate([test.response] + ([] if test.force is None else [test.force]), axis=1)
-    deviations = (test.response_std, test.response), (test.force_std, test.force)
+    every = test.outputs
+    deviations = (raised(test.response_std), test.response), (raised(test.force_std), test.force)
     stds = [np.ones(H.shape) if std is None else std for std, H in deviations if H is not None]
     pole = omega * (-ratios + 1j * np.sqrt(1 - ratios**2))
     plain, hann = (
@@ -198,10 +197,8 @@ def _by_window(
     columns = np.concatenate([plain, np.stack([x**0 + 0j, 1j * x, x**2 + 0j])])
     size = np.sqrt(np.mean(np.abs(columns) ** 2, axis=1))
     off, left, std = np.zeros((2, *every.shape), complex), 0.0, np.concatenate(stds, axis=1)
-    weights = np.divide(1.0, std, out=np.zeros(std.shape), where=std > 0)
     for at in np.ndindex(every.shape[:2]):
-        weight = weights[at]
-        rows, data = weight * columns / size[:, None], weight * every[at]
+        rows, data = columns / std[at] / size[:, None], every[at] / std[at]
         found = np.linalg.lstsq(np.hstack([rows.real, rows.imag]).T, np.hstack([data.real, data.imag]), rcond=None)[0]
         left += float(np.sum(np.abs(data - found @ rows) ** 2))
         for which, added in zip((some, ~some), off, strict=True):
@@ -286,32 +283,42 @@ def _without_poles(freq: Array) -> ComplexArray:
     return np.stack([np.ones_like(x) + 0j, 1j * x, x**2 + 0j])
 
 
-class AtPoles:
-    """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on those without poles.
+class BesideTerms:
+    """Least squares on functions of poles, log w_k and then log zeta_k (2m,), and on `direct` columns without poles.
 
-    Of the latter `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
+    With `velocity` residues have a part in quadrature too.
     """
 
-    def __init__(self, records: Records, poles: Array) -> None:
+    def __init__(self, records: Records, poles: Array, direct: Array, *, velocity: bool) -> None:
         self.records, self.poles = records, poles
         self.omega, self.ratios = np.exp(poles.reshape(2, -1))
-        direct = records.basis(_without_poles(records.freq), records.driven)
-        functions = records.functions(self.omega, self.ratios, velocity=True)
+        functions = records.functions(self.omega, self.ratios, velocity=velocity)
         self.basis, R, size = orthonormal(functions._replace(shared=np.hstack([direct, functions.shared])))
         answered = self.basis.answers(records.data)
         self.left = records.data - self.basis.times(answered)
         regular = scipy.linalg.lapack.dtrcon(R)[0] > ROUND_OFF
         inverse = scipy.linalg.lapack.dtrtri(R)[0] if regular else np.linalg.pinv(R, rcond=ROUND_OFF)
-        inverse /= size[:, None]
-        beta, self.count = inverse @ answered, len(R)
+        self.inverse = inverse / size[:, None]
+        self.beta, self.count = self.inverse @ answered, len(R)
         of_poles = self.count - functions.shared.shape[1]  # behind those of one run each, and those without poles
-        of_runs = of_poles - direct.shape[1]
-        at = slice(of_runs, of_runs + 2 * records.driven)
-        self.terms, self.rows = beta[at], inverse[at]
-        residues = functions.in_order([beta[:of_runs], beta[of_poles:]])
+        self.of_runs = of_poles - direct.shape[1]
+        residues = functions.in_order([self.beta[: self.of_runs], self.beta[of_poles:]])
         self.residues = residues.reshape(self.omega.size, -1, residues.shape[1])
         least = ROUND_OFF * np.linalg.norm(records.data, axis=0) + np.finfo(float).tiny
         self.level = np.maximum(np.linalg.norm(self.left, axis=0), least)
+
+
+class AtPoles(BesideTerms):
+    """The same with the terms 1, i w and w².
+
+    Of these `terms` (2 driven inputs, channels) belong to 1 and i w, and `rows` make them of independent errors.
+    """
+
+    def __init__(self, records: Records, poles: Array) -> None:
+        direct = records.basis(_without_poles(records.freq), records.driven)
+        super().__init__(records, poles, direct, velocity=True)
+        at = slice(self.of_runs, self.of_runs + 2 * records.driven)
+        self.terms, self.rows = self.beta[at], self.inverse[at]
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:

@@ -85,7 +85,7 @@ def scatter_of_lines(test: Measurement, modes: Modes, rigid: Array, most: int = 
     if not may_grow(test) or modes.phi.size > most:
         return None
     whole = replace(SteadyLines.of(test.n_runs, test.freq, grows=False), plain=True)
-    m, channels = modes.omega.size, test.n_sensors + (0 if test.force is None else test.n_base)
+    m, channels = modes.omega.size, test.outputs.shape[1]
     p = Parameters(modes, rigid, np.zeros((m, 0)), np.zeros((test.n_runs, channels, 0)))
     model = RecordModel(replace(test, whole=whole), m)
     if model.numbers <= model.unknowns:

@@ -15,7 +15,7 @@ from sysid.modal_analysis.law_spectra import without_laws
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import Chunk
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, real_times, stacked, weights_of_numbers
+from sysid.modal_analysis.response import columns, misfits, real_times, stacked, states_noise, weights_of_numbers
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import EPSILON, beyond_chance
 
@@ -61,18 +61,16 @@ def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[t
     Of the responses and, where measured, of the force, (runs, channels, n_freq); inferred noise allows for the number
     of unknowns.
     """
-    parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
-    if test.force is not None:
-        parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
     lines = np.count_nonzero(test.own_lines)  # of all runs
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
-    misfits: list[tuple[ComplexArray, Array]] = []
-    for record, stated, misfit in parts:
+    found: list[tuple[ComplexArray, Array]] = []
+    recorded = [record for record in (test.response, test.force) if record is not None]
+    for record, (misfit, stated) in zip(recorded, misfits(test, structure), strict=True):
         numbers = lines * record.shape[1]
         noise = np.sqrt(np.sum(np.abs(misfit) ** 2) / numbers / left) if stated is None else stated
         least = EPSILON * np.sqrt(np.sum(np.abs(record) ** 2) / numbers)
-        misfits.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
-    return misfits
+        found.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
+    return found
 
 
 def noise_records(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
@@ -93,8 +91,7 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int, scatte
     """
     freedom = 2 * test.numbers - unknowns
     if freedom <= 0:
-        stated = test.response_std is not None and (test.force is None or test.force_std is not None)
-        return 1.0 if stated else np.nan
+        return 1.0 if states_noise(test) else np.nan
     reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
     if reduced < _FAR_BELOW:
         return 1.0
@@ -133,18 +130,14 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     if test.force is not None:
         push = M @ structure.rigid_body_dofs + structure.mass[:n, n:]
         transients = np.concatenate([transients, push.T @ both], axis=1)
-    left = test.response - np.einsum("sd,rdf->rsf", test.rigid_body, test.base) - test.predict(structure)
-    if test.force is not None:
-        left = np.concatenate([left, test.force - test.predict_force(structure)], axis=1)
+    left = np.concatenate([one for one, _ in misfits(test, structure)], axis=1)
     taken = np.zeros_like(left)
     transients = np.moveaxis(transients, 0, -1)  # (c, 2 n, L)
     for run, (lines, rest) in enumerate(zip(test.own_lines, test.whole.at_rest, strict=True)):
         of_ends = transients[:, :0] if rest else transients
         traces = test.whole.traces(test.freq[lines], test.freq[-1])[: test.whole.of_sampling]
         taken[run][:, lines] = _fitted(left[run][:, lines], of_ends[..., lines], traces)
-    s = test.n_sensors
-    force = None if test.force is None else test.force - taken[:, s:]
-    return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
+    return test.less(taken, whole=None)
 
 
 def _fitted(left: ComplexArray, transients: ComplexArray, traces: ComplexArray) -> ComplexArray:
@@ -176,7 +169,7 @@ def left_of(fit: RecordFit) -> float:
 
 def without_transients(fit: RecordFit) -> Measurement:
     """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
-    test, model, p, n = fit.test, fit.model, fit.parameters, fit.test.n_sensors
+    test, model, p = fit.test, fit.model, fit.parameters
 
     def transients(chunk: Chunk) -> ComplexArray:
         at_rest = chunk if not p.laws else model.chunk(replace(p, laws=()), chunk.run)
@@ -184,10 +177,7 @@ def without_transients(fit: RecordFit) -> Measurement:
 
     taken = at_lines(fit, transients)
     std, force_std = deviations(fit)
-    return replace(
-        test, whole=None, response=test.response - taken[:, :n], response_std=std,
-        force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
-    )  # fmt: skip
+    return test.less(taken, whole=None, response_std=std, force_std=force_std)
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

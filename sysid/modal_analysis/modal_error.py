@@ -7,6 +7,7 @@ frequency and damping ratio alone, so all second derivatives are products of sma
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import ComplexArray
@@ -62,9 +63,10 @@ class ModalError:
         self.shapes = (m, c), (d * with_base, c), (d, m), (1, m), (1, m)  # each by columns, so that rows are entries
         self.ends = np.cumsum([rows * across for rows, across in self.shapes])
         size = int(self.ends[-1])
-        self.value = NumpyFunction(size, [(1, 1)], lambda y: [self._value(self._at(y)[3])])
-        self.gradient = NumpyFunction(size, [(1, 1), (size, 1)], self._gradient)
-        self.hessian = NumpyFunction(size, [(size, size)], self._hessian)
+        one, column, matrix = ca.Sparsity.dense(1), ca.Sparsity.dense(size), ca.Sparsity.dense(size, size)
+        self.value = NumpyFunction(lambda y: [self._value(self._at(y)[3])], [column], [one])
+        self.gradient = NumpyFunction(self._gradient, [column], [one, column])
+        self.hessian = NumpyFunction(self._hessian, [column], [matrix])
 
     def _value(self, pull: ComplexArray) -> float:
         return float(np.sum(np.abs(pull) ** 2 / self.channel[:, None] ** 2)) / 4

@@ -68,7 +68,7 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
     """The fit with modes at these peaks, less those that a few steps show to be worth too little; None without any."""
     least, m, p = least_worth(fit.model), fit.model.m, fit.parameters
     for peak in peaks:
-        p = _with(fit, p, peak)
+        p = with_peak(fit, p, peak)
     monitor.doing = f"{m} modes and {len(peaks)} more"
     while p.modes.omega.size > m:
         more = refitted(fit, p, limits=ROUGH, some=some, monitor=monitor)
@@ -170,7 +170,7 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         peak = next((one for one in peaks_of(fit, price) if last < one.omega < far), None)
         if peak is None:
             return fit
-        more = refitted(fit, _with(fit, fit.parameters, peak), limits=TRIAL, monitor=monitor)
+        more = refitted(fit, with_peak(fit, fit.parameters, peak), limits=TRIAL, monitor=monitor)
         omega = more.parameters.modes.omega[: -fit.static]
         stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
         if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):
@@ -361,7 +361,7 @@ def peaks_of(fit: RecordFit, least: float, widths: float = 5.0) -> list[Peak]:
     return [Peak(trials.omega[at], trials.ratios[at], shapes[at], loads[at]) for at in found]
 
 
-def _with(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
+def with_peak(fit: RecordFit, p: Parameters, peak: Peak) -> Parameters:
     """Parameters with one more mode, before those that are static."""
     model, (omega, ratio, shape, push) = fit.model, peak
     n, d = model.n, model.d

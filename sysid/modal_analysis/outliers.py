@@ -46,7 +46,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.misfit import SUSPECT
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import gains
+from sysid.modal_analysis.response import gains, predicted, records_of
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
@@ -129,11 +129,6 @@ def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -
 def numbers_at_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
     """Numbers of a record (runs, channels, n_freq) at each run's own lines (runs, n_freq), one after the other."""
     return record.transpose(0, 2, 1)[lines].ravel()
-
-
-def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
-    """Prediction of relative accelerations and, where it was measured, of the force by a structure."""
-    return [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
 
 
 def weight(u: ComplexArray) -> Array:
@@ -288,7 +283,7 @@ def _without_absorbed(
     """
     parts = whitened(clean, _predicted(fit, test.freq, test.base), 2 * fit.omega.size)
     stds = np.concatenate([part.std for part in parts], axis=1)
-    recorded = clean.relative if clean.force is None else np.concatenate([clean.relative, clean.force], axis=1)
+    recorded = np.concatenate([record for record, _ in records_of(clean)], axis=1)
     off = np.zeros_like(recorded)
     here = np.arange(test.freq.size)
     decide = Records(clean).leverage(fit.omega, fit.ratios) > _DECIDES

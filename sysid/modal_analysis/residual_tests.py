@@ -165,8 +165,7 @@ def varying_levels(fit: RecordFit) -> tuple[VaryingLevel, ...]:
 def unidentifiable_levels(fit: RecordFit) -> tuple[tuple[int, int], ...]:
     """Run and channel of levels that were found and that the records do not determine; none where there is no noise."""
     assert fit.test.whole is not None
-    outputs = fit.test.response if fit.test.force is None else np.concatenate([fit.test.response, fit.test.force], 1)
-    power = np.sum(np.abs(np.concatenate([outputs, fit.test.base], axis=1)) ** 2, axis=2)
+    power = np.sum(np.abs(np.concatenate([fit.test.outputs, fit.test.base], axis=1)) ** 2, axis=2)
     rms = np.sqrt(power / (fit.test.own_lines.sum(axis=1) * fit.test.whole.density)[:, None])
     if fit.test.whole.noise is not None or np.all(np.sqrt(fit.levels_of_runs) <= NO_NOISE * rms):
         return ()

@@ -92,32 +92,22 @@ def residual(
     """
     u_re, u_im = parts_of(test.base)
     q_re, q_im = modal_motion(test.base, gamma, modal_gains(omega, ratios, test.freq, shift))
-    a_re, a_im = parts_of(test.relative)
-    misfits = [(phi @ q_re - a_re, phi @ q_im - a_im)]
-    if test.force is not None:
-        f_re, f_im = parts_of(test.force)
-        misfits.append(
-            tuple(gamma.T @ q + rigid_body_mass @ u - f for q, u, f in ((q_re, u_re, f_re), (q_im, u_im, f_im)))
-        )
+    force = gamma.T @ q_re + rigid_body_mass @ u_re, gamma.T @ q_im + rigid_body_mass @ u_im
+    every = zip(records_of(test), weights_of_test(test, weighted=weighted), strict=True)
     pieces = [
-        ca.DM(weight / scale) * part
-        for parts, (weight, scale) in zip(misfits, weights_of_test(test, weighted=weighted), strict=True)
-        for part in parts
+        ca.DM(weight / scale) * (predicted - recorded)
+        for parts, ((record, _), (weight, scale)) in zip(((phi @ q_re, phi @ q_im), force), every, strict=False)
+        for predicted, recorded in zip(parts, parts_of(record), strict=True)
     ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 
 def weighted_error(test: Measurement, structure: Structure) -> float:
     """Norm of `residual` of a structure, its records weighed by stated noise."""
-    pairs = [(test.relative, test.predict(structure))]
-    if test.force is not None:
-        pairs.append((test.force, test.predict_force(structure)))
-    weights = weights_of_test(test, weighted=True)
-    rows = [
-        np.linalg.norm(weight * columns(predicted - record)) / scale
-        for (record, predicted), (weight, scale) in zip(pairs, weights, strict=True)
-    ]
-    return float(np.linalg.norm(rows))
+    both = zip(misfits(test, structure), weights_of_test(test, weighted=True), strict=True)
+    return float(
+        np.linalg.norm([np.linalg.norm(weight * columns(left)) / scale for (left, _), (weight, scale) in both])
+    )
 
 
 def error_of_accelerations(test: Measurement, structure: Structure) -> float:
@@ -142,6 +132,22 @@ def records_of(test: Measurement) -> list[tuple[ComplexArray, Array | None]]:
     """The relative accelerations and, where it was measured, the base force, each with its stated deviations."""
     records = [(test.relative, test.response_std)]
     return records if test.force is None else [*records, (test.force, test.force_std)]
+
+
+def states_noise(test: Measurement) -> bool:
+    """True where the noise of all `records_of` a test is stated."""
+    return all(std is not None for _, std in records_of(test))
+
+
+def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
+    """Prediction of relative accelerations and, where it was measured, of the force by a structure."""
+    return [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
+
+
+def misfits(test: Measurement, structure: Structure) -> list[tuple[ComplexArray, Array | None]]:
+    """What a structure leaves of the `records_of` a test, each with its stated deviations."""
+    both = zip(records_of(test), predicted(test, structure), strict=True)
+    return [(record - fitted, std) for (record, std), fitted in both]
 
 
 def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, float]]:

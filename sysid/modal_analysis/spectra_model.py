@@ -81,12 +81,11 @@ class SpectraModel(SpectralModel):
     """
 
     def __init__(self, test: Measurement, weights: Weights, pole: NDArray[np.intp]) -> None:
-        outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         every = [weights.lines] + [weights.force_lines] * (weights.force_lines is not weights.lines)
         runs = [
             Run(2 * np.pi * test.freq, base * line, records * line, 1.0, number, np.ones(line.size), 0)
             for lines in every
-            for number, (base, records, line) in enumerate(zip(test.base, outputs, lines, strict=True))
+            for number, (base, records, line) in enumerate(zip(test.base, test.outputs, lines, strict=True))
         ]
         runs = [run._replace(piece=piece) for piece, run in enumerate(runs)]
         super().__init__(test, pole.size, runs)

@@ -415,7 +415,7 @@ class ModeFit:
         """Share of one real number of the records in what a fit leaves, as it affects smooth functions."""
         test, (free, noise) = self.test, self._free_residues(*_poles_of(best))
         shared = noise / self.records.variance(float(np.sum(free.left**2)), free.residues.size)
-        numbers = 2 * (test.response.size + (0 if test.force is None else test.force.size))
+        numbers = 2 * test.outputs.size
         unknowns = best.modes.omega.size * (test.n_sensors + test.n_base + 1)
         return shared * best.residual**2 / max(numbers - unknowns, 1)
 

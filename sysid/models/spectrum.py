@@ -6,16 +6,14 @@ nonlinear programme in the entries of L_H, through IPOPT with exact gradient and
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
 from sysid.models.expressions import triangle, triangle_entries
-from sysid.nlp import quiet_options
+from sysid.nlp import NumpyFunction, quiet_options
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 
@@ -142,16 +140,15 @@ def _check(factors: Array, targets: Array) -> None:
         raise InputError(f"{targets.size} target frequencies for a model with {factors.shape[-1]}")
 
 
-def derivatives_of(distance: SpectrumDistance) -> dict[str, _InNumbers]:
+def derivatives_of(distance: SpectrumDistance) -> dict[str, NumpyFunction]:
     """A distance, its gradient and its Hessian as IPOPT asks for them; to be kept for as long as it runs."""
     size = distance.rows.size
     x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
-    below = np.tril_indices(size)  # by rows, as CasADi stores the upper triangle of a symmetric matrix by columns
     return {
-        "f": _InNumbers(lambda at: [distance.value(at)], [x], [one]),
-        "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
-        "hess_lag": _InNumbers(
-            lambda at, _, weight, __: [float(weight) * distance.hessian(at)[below]],
+        "f": NumpyFunction(lambda at: [distance.value(at)], [x], [one]),
+        "grad_f": NumpyFunction(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
+        "hess_lag": NumpyFunction(
+            lambda at, _, weight, __: [ca.triu(ca.DM(float(weight) * distance.hessian(at)))],
             [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
         ),
     }  # fmt: skip
@@ -170,43 +167,6 @@ def minimum(distance: SpectrumDistance, start: Array, lower: Array, max_time: fl
         if function.interrupt is not None:
             raise function.interrupt
     return end, str(solve.stats()["return_status"])
-
-
-class _InNumbers(ca.Callback):
-    """A function of NumPy as CasADi calls it: of a column and other matrices, to the entries of what it gives."""
-
-    def __init__(
-        self, function: Callable[..., list[Any]], inputs: list[ca.Sparsity], outputs: list[ca.Sparsity]
-    ) -> None:
-        ca.Callback.__init__(self)
-        self._function, self._inputs, self._outputs = function, inputs, outputs
-        self.interrupt: BaseException | None = None  # IPOPT would take it for a step too long
-        self.construct("in_numbers", {})
-
-    def get_n_in(self) -> int:
-        """Number of inputs."""
-        return len(self._inputs)
-
-    def get_n_out(self) -> int:
-        """Number of outputs."""
-        return len(self._outputs)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Pattern of an input."""
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Pattern of an output."""
-        return self._outputs[i]
-
-    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
-        """Call the function."""
-        try:
-            results = self._function(np.array(arguments[0].nonzeros()), *arguments[1:])
-        except KeyboardInterrupt as interrupt:
-            self.interrupt = interrupt
-            raise
-        return [ca.DM(shape, result) for result, shape in zip(results, self._outputs, strict=True)]
 
 
 def spectrum_error(factor: Array, targets: Array) -> float:

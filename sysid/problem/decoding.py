@@ -211,8 +211,8 @@ class _Matrices:
             return [operations.RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
         solver = name.partition(" ")[2]
         others: dict[str, Callable[[list[ca.MX], list[int]], list[ca.MX]]] = {
-            "const": self._const, "getnonzeros": self._getnonzeros, "setnonzeros": self._setnonzeros,
-            "addnonzeros": self._addnonzeros, "einstein": self._einstein, "call": self._call,
+            "const": self._const, "getnonzeros": self._getnonzeros, "einstein": self._einstein, "call": self._call,
+            "setnonzeros": partial(self._into, add=False), "addnonzeros": partial(self._into, add=True),
             f"solve {solver}".strip(): partial(self._solve, solver),
         }  # fmt: skip
         if name not in others:
@@ -255,13 +255,9 @@ class _Matrices:
         (x,) = _exactly(1, arguments)
         return [operations.get_nonzeros(x, pattern, _places(parameters[1:]))]
 
-    def _setnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
+    def _into(self, arguments: list[ca.MX], parameters: list[int], *, add: bool) -> list[ca.MX]:
         y, x = _exactly(2, arguments)
-        return [operations.set_nonzeros(y, x, _places(parameters), add=False)]
-
-    def _addnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
-        y, x = _exactly(2, arguments)
-        return [operations.set_nonzeros(y, x, _places(parameters), add=True)]
+        return [operations.set_nonzeros(y, x, _places(parameters), add=add)]
 
     def _einstein(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         lists, at = list[list[int]](), 0

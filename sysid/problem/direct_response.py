@@ -21,7 +21,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, index_of, matched, theta_of
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.response import parts_of, weights_of_test
+from sysid.modal_analysis.response import parts_of, records_of, weights_of_test
 from sysid.models.complex_expressions import ComplexExpression
 from sysid.problem.matrices import Matrices, Motion
 from sysid.problem.residual_terms import ResidualTerms
@@ -75,10 +75,9 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     """Relative residuals, stacked, as `response.residual` has them: of accelerations, then of a measured force."""
     a, f = relative_response(test, motion, shift=shift)
     R = ca.DM(motion.recovery)
-    records = [(test.relative, ComplexExpression(R @ a.real, R @ a.imag))]
-    records += [] if test.force is None else [(test.force, f)]
+    found, weights = (ComplexExpression(R @ a.real, R @ a.imag), f), weights_of_test(test, weighted=weighted)
     pieces: list[ca.MX] = []
-    for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):
+    for (record, _), predicted, (weight, scale) in zip(records_of(test), found, weights, strict=False):
         real, imag = parts_of(record)
         pieces += [ca.DM(weight / scale) * part for part in (predicted.real - real, predicted.imag - imag)]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))

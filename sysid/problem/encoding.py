@@ -25,7 +25,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.problem import operations
 from sysid.problem.decoding import Tree, decode
-from sysid.problem.operations import interpolant_data, interpolant_options, is_compiled, same_text
+from sysid.problem.operations import interpolant_data, interpolant_options, is_compiled
 from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
@@ -316,7 +316,7 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
             same = ca.Function("solve", symbols, [operations.linear_solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
             continue
-        if same_text(solve, same):
+        if solve.serialize() == same.serialize():  # node by node and option by option
             return f"solve {solver}".strip(), [int(transposed)]
     raise NotStorableError("the operation 'solve', by a linear solver with options or of another kind")
 

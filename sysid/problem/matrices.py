@@ -86,10 +86,7 @@ def _numbers(name: str, value: Any) -> Array:
             f"Problem: {name} ({user_site()}) is complex, and a matrix of a structure is real: give its real part; "
             "a loss factor eta of a complex stiffness is a damping ratio eta / 2 of each mode, damping=[eta / 2, ...]",
         ),
-        (
-            matrix.ndim not in _DIMENSIONS[name],
-            f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}",
-        ),
+        (matrix.ndim not in _DIMENSIONS[name], f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}"),
     )
     return matrix.real.copy()
 
@@ -314,6 +311,18 @@ def assemble(
         rigid_body=None if recovery is None else test.rigid_body,
         sensors=test.sensors,
     )
+
+
+def blocks_of_modes(
+    P: Array, gamma: Array, omega: Array, G: Array, remainder: Array
+) -> tuple[Array, Array, Array, Array]:
+    """M_SS, M_S0, M_00 and K_SS of modes: P (n, n) the inverse of their shapes at the degrees of freedom, rad/s.
+
+    `gamma` and G (n, d) are participations and rigid motion, `remainder` (d, d) the rigid-body mass that no mode
+    carries.
+    """
+    delta = gamma - P @ G
+    return P.T @ P, P.T @ delta, delta.T @ delta + remainder, (P.T * omega**2) @ P
 
 
 class Blocks(NamedTuple):

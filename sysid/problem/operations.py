@@ -21,11 +21,6 @@ from sysid.errors import InputError
 _NUMBER, _COUNT = "<cd", "<cq"  # a letter for the type, and eight bytes
 
 
-def same_text(one: ca.Function, other: ca.Function) -> bool:
-    """True where two functions are the same, node by node and option by option."""
-    return bool(one.serialize() == other.serialize())
-
-
 def is_compiled(function: ca.Function) -> bool:
     """True where a function, or one that it calls, is to be compiled (CasADi's option jit)."""
     try:

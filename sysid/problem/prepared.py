@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -14,17 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.files.tree import check_tree
-from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
-from sysid.modal_analysis.delays import Clock, Delays, stored_delays
+from sysid.modal_analysis.calibration import Calibration, calibrated
+from sysid.modal_analysis.delays import Clock, Delays
 from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes, without_static_modes
-from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
+from sysid.modal_analysis.outliers import Outlier, outliers, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.response import predicted
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
@@ -35,6 +35,7 @@ from sysid.problem.feasible import HELD, check_constraints, scale_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES, geometry_of, rough_mass
 from sysid.problem.stated import StatedProblem
+from sysid.problem.stored import stored_fits
 from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array, Structure
 from sysid.swarm import box
@@ -182,14 +183,8 @@ class Prepared(SearchSpace):
     @classmethod
     def from_tree(cls, stated: StatedProblem, tree: dict[str, Any]) -> Prepared:
         """Make what `to_tree` made a tree of, with the fits of its whole records."""
-        tests, delays = stated.tests, stored_delays(tree, stated.tests)
-        calibrations = stored_calibrations(tree, tests)
-        fits = tree.get("fits") or [None] * len(tests)  # results of before hold none
-        read = [
-            fit and RecordFit.from_tree(fit, without_delays(calibrated(test, calibration), late.values))
-            for fit, test, late, calibration in zip(fits, tests, delays, calibrations, strict=True)
-        ]
-        return cls(stated, delays=delays, fits=read, calibrations=calibrations)
+        delays, calibrations, fits = stored_fits(tree, stated.tests)
+        return cls(stated, delays=delays, fits=fits, calibrations=calibrations)
 
     @cached_property
     def delays(self) -> tuple[Delays | None, ...]:
@@ -489,7 +484,6 @@ class Prepared(SearchSpace):
         given = all(one.records is one.given for one in self.screened.modal)
         poles = self.geometry.found if given else None
         fits = [one.record_fit and one.record_fit.to_tree() for one in self.modal]
-        delays = [None if one.delays is None else one.delays.to_tree() for one in self.modal]
-        gains = [None if one.calibration is None else one.calibration.to_tree() for one in self.modal]
-        found = {"poles": poles and asdict(poles), "fits": fits, "delays": delays, "calibrations": gains}
-        return {**self.stated.to_tree(), **found}
+        fields = lambda one: None if one is None else dict(vars(one))  # noqa: E731
+        delays, gains = ([fields(getattr(one, name)) for one in self.modal] for name in ("delays", "calibration"))
+        return {**self.stated.to_tree(), "poles": fields(poles), "fits": fits, "delays": delays, "calibrations": gains}

@@ -26,7 +26,7 @@ from sysid.measurement.whole import products
 from sysid.modal_analysis.modal_fit import STATIC_POLE, separate_poles
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import ABOVE, columns, gains, records_of, weights_of_test
+from sysid.modal_analysis.response import ABOVE, columns, gains, misfits, records_of, weights_of_test
 from sysid.modal_analysis.spectra_modes import misses_static
 from sysid.models.model import Geometry
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -162,13 +162,8 @@ class ResidualTerms:
         test, d = self.test, self.test.n_base
         if not self.omega.size:
             return ResidualModes.none(test.n_sensors, d)
-        predicted = [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
-        left = [
-            weight / scale * columns(record - answer)
-            for (record, _), answer, (weight, scale) in zip(
-                records_of(test), predicted, weights_of_test(test, weighted=True), strict=True
-            )
-        ]
+        both = zip(misfits(test, structure), weights_of_test(test, weighted=True), strict=True)
+        left = [weight / scale * columns(one) for (one, _), (weight, scale) in both]
         of_channel = zip(self._columns[0], left[0], strict=True)
         residues = np.array([_solved(group, _as_rows(row[None, None])[:, 0]) for group, row in of_channel])
         shapes = residues.reshape(len(residues), -1, d)  # (n_sensors, p, d)

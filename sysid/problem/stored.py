@@ -17,7 +17,11 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError, refuse, shown
+from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
+from sysid.modal_analysis.delays import Delays, stored_delays
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.expressions import as_matrix, is_column, is_expression
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import plain
@@ -182,16 +186,29 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         what = "".join(filter(str.isprintable, tree["without"]))  # nothing that moves a terminal's cursor
         raise NotRebuiltError(f"it was stored without the expressions of its problem, as {what} cannot be stored")
     variables = {part["name"]: _variable_from_tree(part) for part in tree["variables"]}
-    symbols = [variable.symbol for variable in variables.values()]
+    symbols, misfit = [variable.symbol for variable in variables.values()], tree["misfit"]
     made = [] if tree["expressions"] is None else decode(tree["expressions"], symbols)
     outputs: dict[int | None, ca.MX | None] = {None: None, **dict(enumerate(made))}
     return {
         **_matrices_from_tree(tree, outputs),
         "residuals": [_residual_from_tree(part, outputs) for part in tree["residuals"]],
         "constraints": [outputs[i] for i in tree["constraints"].tolist()],
-        "misfit": _misfit_from_tree(tree["misfit"], outputs),
+        "misfit": _residual_from_tree(misfit, outputs) if isinstance(misfit, dict) else outputs[misfit],
         "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
     }
+
+
+def stored_fits(
+    tree: dict[str, Any], tests: Sequence[Measurement]
+) -> tuple[list[Delays], list[Calibration | None], list[RecordFit | None]]:
+    """Delays and gains of the tests of a stored problem, and the fits of their whole records."""
+    delays, gains = stored_delays(tree, tests), stored_calibrations(tree, tests)
+    given = zip(tree.get("fits") or [None] * len(tests), tests, delays, gains, strict=False)
+    fits = [
+        fit and RecordFit.from_tree(fit, without_delays(calibrated(test, gain), d.values))
+        for fit, test, d, gain in given
+    ]
+    return delays, gains, fits
 
 
 def needs_module(tree: Tree) -> bool:
@@ -312,10 +329,6 @@ def _misfit_to_tree(value: Any, outputs: _Outputs) -> Any:
     if not isinstance(value, ComplexResidual):
         return outputs.add("misfit", value)
     return {"kind": "complex", "expression": outputs.add("misfit", value.stacked), "force": value.force}
-
-
-def _misfit_from_tree(tree: Any, outputs: Mapping[int | None, Any]) -> Any:
-    return _residual_from_tree(tree, outputs) if isinstance(tree, dict) else outputs[tree]
 
 
 def _model_from_tree(tree: Tree) -> Any:

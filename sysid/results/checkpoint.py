@@ -162,7 +162,7 @@ class Checkpoint:
             remedy = "take it away, or give another file"
             refuse((tree.get("search") != search, f"{self.path} is of another search: {changed}; {remedy}"))
             entries = self._entries(tree)
-        request = None if self.request is None else self.request.to_tree()
+        request = self.request and self.request.to_tree()
 
         def write(kept: Tree) -> None:
             tree = {"content": _CONTENT, "search": search, "begun": request, "entries": kept}

@@ -12,16 +12,16 @@ from sysid.assessment.assumptions import assumptions
 from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.finding import Finding
-from sysid.measurement.clocks import without_delays
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
-from sysid.modal_analysis.delays import Delays, stored_delays
+from sysid.modal_analysis.calibration import Calibration
+from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import MATRICES
 from sysid.problem.prepared import Prepared
+from sysid.problem.stored import stored_fits
 from sysid.problem.terms import FurtherTest
 from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
@@ -177,19 +177,11 @@ class StoredRecords:
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
-        test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
-        (delays,), (calibration,) = stored_delays(tree, [test]), stored_calibrations(tree, [test])
-        on_clock = without_delays(calibrated(test, calibration), delays.values)
-        return cls(
-            test,
-            None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
-            tuple(Measurement.from_tree(test) for test in tree["validation"]),
-            tree["goal"],
-            tree["loss"],
-            delays,
-            calibration,
-            None if fits[0] is None else RecordFit.from_tree(fits[0], on_clock),
-        )
+        test, reference = Measurement.from_tree(tree["measurement"]), tree["reference"]
+        (delays,), (calibration,), (fit,) = stored_fits(tree, [test])
+        validation = tuple(map(Measurement.from_tree, tree["validation"]))
+        known = reference and Structure.from_tree(reference)
+        return cls(test, known, validation, tree["goal"], tree["loss"], delays, calibration, fit)
 
 
 @dataclass(frozen=True, eq=False)

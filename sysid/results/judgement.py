@@ -20,14 +20,15 @@ from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.problem.matrices import assemble
+from sysid.modal_analysis.response import states_noise
+from sysid.problem.matrices import assemble, blocks_of_modes
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.modal import objective_of
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session, TimeIsOver, within
-from sysid.search.stated_masses import to_stated_totals
+from sysid.search.stated_masses import positive_part, to_stated_totals
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
@@ -183,15 +184,11 @@ def _structure(problem: Prepared, first: Structure, before: Array, after: Array,
     else:
         left = rigid - end.gamma.T @ end.gamma
         size = np.sqrt(np.diag(rigid))
-        lam, V = np.linalg.eigh(left / np.outer(size, size))
-        left = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
-    M_SS = P.T @ P
-    delta = end.gamma - P @ G
+        left = positive_part(left / np.outer(size, size)) * np.outer(size, size)
     loss = first.modal_damping_matrix[np.ix_(order, order)]
     loss = loss - np.diag(np.diag(loss)) + np.diag(2 * end.ratios * end.omega)
     return assemble(
-        M_SS, P.T @ end.gamma - M_SS @ G, delta.T @ delta + left, (P.T * end.omega**2) @ P, G,
-        ratios=end.ratios if first.modal_damping else None,
+        *blocks_of_modes(P, end.gamma, end.omega, G, left), G, ratios=end.ratios if first.modal_damping else None,
         damping=None if first.modal_damping else P.T @ loss @ P, test=problem.measurement,
     )  # fmt: skip
 
@@ -270,9 +267,7 @@ def _in_words(problem: Prepared, stated: Statements, row: int, value: float, off
 def _numbers(problem: Prepared, index: Index) -> float:
     """Degrees of freedom of the records' own noise; infinite where it is stated."""
     test = problem.measurement
-    if test.response_std is not None and (test.force is None or test.force_std is not None):
-        return np.inf
-    return float(max(2 * test.numbers - index.size, 1))
+    return np.inf if states_noise(test) else float(max(2 * test.numbers - index.size, 1))
 
 
 def _chance(found: Adjusted, numbers: float) -> float:

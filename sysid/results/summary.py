@@ -95,12 +95,7 @@ def _noise(it: Answer) -> list[str]:
 def _gains(it: Answer) -> list[str]:
     """Table of each sensor's gain as the records show it."""
     rows = [
-        (
-            g.sensor,
-            f"{g.gain:.4f}",
-            tables.half_width(g.std, g.gain),
-            "-" if np.isnan(g.worth) else f"{g.worth:.2g}",
-        )
+        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
         for g in tables.gains_of_sensors(it)
     ]
     head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")

@@ -13,7 +13,7 @@ from sysid.assessment.checks.stated import sides_of
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.residues import independent
-from sysid.modal_analysis.response import of_residual_modes, residual_share
+from sysid.modal_analysis.response import misfits, of_residual_modes, records_of, residual_share
 from sysid.results.answer import Answer
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT, LIKELY, ROUND_OFF
@@ -269,18 +269,11 @@ class FitOfChannel(NamedTuple):
 def fit_of_channels(it: Answer) -> list[FitOfChannel]:
     """A row a sensor, by its acceleration relative to the base, and a direction of the base force, where measured."""
     test, s = it.fitted.records, it.structure
-    motion, pull = of_residual_modes(test, s)
-    records = [(test.sensor_names, test.relative, test.predict(s), motion)]
-    if test.force is not None:
-        names = tuple(f"base force {axis}" for axis in test.base_axes)
-        records.append((names, test.force, test.predict_force(s), pull))
-    return [
-        FitOfChannel(name, float(left), float(beyond))
-        for names, record, predicted, added in records
-        for name, left, beyond in zip(
-            names, share_of_channels(predicted - record, record), share_of_channels(added, record), strict=True
-        )
-    ]
+    names = (*test.sensor_names, *(f"base force {axis}" for axis in test.base_axes))
+    parts = [one for one, _ in records_of(test)], [one for one, _ in misfits(test, s)], of_residual_modes(test, s)
+    records, left, added = (np.concatenate(part, axis=1) for part in parts)
+    shares = share_of_channels(left, records), share_of_channels(added[:, : records.shape[1]], records)
+    return [FitOfChannel(name, *map(float, both)) for name, *both in zip(names, *shares, strict=False)]
 
 
 def residual_modes(it: Answer) -> list[str]:

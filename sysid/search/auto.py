@@ -18,7 +18,8 @@ from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
 from sysid.modal_analysis.fit import of_calibrated_lines
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
+from sysid.modal_analysis.outliers import HUBER, loss, whitened
+from sysid.modal_analysis.response import predicted
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.search.continuation import Continuation
@@ -31,10 +32,7 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
 STRATEGIES: tuple[type[Modal] | type[Continuation] | type[Swarm], ...] = (Modal, Continuation, Swarm)  # as "auto" goes
-NAMED: dict[str, Callable[[], Strategy]] = {
-    **{kind.name: kind for kind in STRATEGIES},
-    "hpso-ls": Swarm.published,
-}
+NAMED: dict[str, Callable[[], Strategy]] = {**{kind.name: kind for kind in STRATEGIES}, "hpso-ls": Swarm.published}
 NAMES = ", ".join(map(repr, ("auto", *NAMED)))
 
 Start = ArrayLike | Structure | None

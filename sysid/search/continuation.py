@@ -130,11 +130,7 @@ def smooth_fits(
 
 
 def descend(
-    problem: Prepared,
-    x: Array,
-    steps: list[tuple[TestTerm, ...]],
-    session: Session,
-    coordinates: Coordinates = "modal",
+    problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session, coordinates: Coordinates = "modal"
 ) -> LocalResult:
     """Fit every step, and at last the records."""
     monitor = session.reporter("local phase")

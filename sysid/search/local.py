@@ -108,11 +108,7 @@ _SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how th
 
 
 def fit_in_matrices(
-    problem: Prepared,
-    x: Array,
-    monitor: IterationMonitor,
-    max_iterations: int,
-    smoothed: Sequence[TestTerm] = (),
+    problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int, smoothed: Sequence[TestTerm] = ()
 ) -> End:
     """Minimise the objective of a problem over its own unknowns, from `x`.
 
@@ -120,7 +116,7 @@ def fit_in_matrices(
     graphs of the derivatives are made, nothing is begun.
     """
     formulation, z = problem.formulation, NonlinearProgram()
-    modal = needs_modes(formulation)
+    modal = formulation.fits_records and formulation.matrices.by_ratios  # damping by ratios has no direct solve
     # The modes themselves stand for a free stiffness; of free modes only the plain entries are asked for here.
     apart = modal and formulation.stiffness.free and not problem.free_modes
     held = formulation.parts.stiffness if apart else slice(0, 0)
@@ -153,11 +149,6 @@ def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[T
     """All terms, with other records in the place of the tests', in their order; none given: as they are."""
     others = iter(smoothed)
     return [next(others, term) if isinstance(term, TestTerm) else term for term in formulation.terms]
-
-
-def needs_modes(formulation: Formulation) -> bool:
-    """True where modes are further unknowns: damping by ratios has no direct solve."""
-    return formulation.fits_records and formulation.matrices.by_ratios
 
 
 def _add_constraints(problem: Prepared, unknowns: ca.MX, z: NonlinearProgram) -> None:

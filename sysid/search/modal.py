@@ -27,13 +27,13 @@ from sysid.modal_analysis.vector_fitting import Poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
-from sysid.problem.matrices import assemble
+from sysid.nlp import IterationMonitor, ended_in_words
+from sysid.problem.matrices import assemble, blocks_of_modes
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.search.degrees_of_freedom import DegreesOfFreedom, degrees_of_freedom, sensors_by_name
 from sysid.search.local import LocalResult, solve
-from sysid.search.modal_program import End, Spectrum, Ties, fit_apart, solve_modes
+from sysid.search.modal_program import End, Ties, fit_apart, free_spectrum, solve_modes
 from sysid.search.session import Session
 from sysid.search.stated_masses import modal_masses_of, positive_part, stated_totals, to_stated_totals
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
@@ -132,34 +132,24 @@ def structure_of_modes(
     Dampers have ``Phi' C Phi`` off its diagonal: `coupling` (m, m), rad/s; of residual modes `across` (r, m + r).
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
     """
-    geometry = problem.geometry
     P, G, groups = chosen.coordinates(problem, modes.phi)
     recovery = modes.phi @ P
     # Exact where a degree of freedom is a sensor.
     recovery[chosen.sensors] = np.eye(len(P))[: chosen.sensors.size]
     gamma = modes.gamma
-    plain = chosen.modes.size == 0 and chosen.sensors.size == geometry.n
+    plain = chosen.modes.size == 0 and chosen.sensors.size == problem.geometry.n
     if to_totals:
         known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma, residual = P * np.sqrt(t), gamma * np.sqrt(t), residual.scaled(np.sqrt(t))
     if across is not None and np.any(across):
         residual = replace(residual, coupling=np.hstack([across[:, : len(P)] @ P, across[:, len(P) :]]))
-    M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
-    M_S0 = P.T @ gamma - M_SS @ G
-    delta = gamma - P @ G
-    K_S0 = -K_SS @ G
-    return Structure(
-        np.block([[M_SS, M_S0], [M_S0.T, delta.T @ delta + remainder]]),
-        np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
-        modes.ratios if coupling is None else None,
-        damping_matrix=None if coupling is None else P.T @ (np.diag(2 * modes.ratios * modes.omega) + coupling) @ P,
-        n_base=geometry.d,
-        recovery=None if plain else recovery,
-        rigid_body=None if plain else geometry.rigid_body,
-        sensors=problem.measurement.sensors,
-        residual=residual,
-    )
+    found = assemble(
+        *blocks_of_modes(P, gamma, modes.omega, G, remainder), G, test=problem.measurement,
+        ratios=modes.ratios if coupling is None else None, recovery=None if plain else recovery,
+        damping=None if coupling is None else P.T @ (np.diag(2 * modes.ratios * modes.omega) + coupling) @ P,
+    )  # fmt: skip
+    return found.with_residual(residual)
 
 
 def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
@@ -270,21 +260,16 @@ def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
 
 
 def modal_structure(
-    problem: Prepared, options: Modal, monitor: IterationMonitor, poles: Poles | None = None
+    problem: Prepared, options: Modal, monitor: IterationMonitor
 ) -> tuple[Structure, ModalFit, DegreesOfFreedom, Poles]:
     """Structure that the data suggest without any search, and how it was fitted.
 
     With a lumped or known mass it is where the local phase in the unknowns starts; its modal masses come from the
     model. A `DoesNotApplyError` where a stated frequency is none of the data's, these do not suffice, or the modes are
-    too much alike at the sensors. Those far above the lines are so where they stand for something else, as a gain.
+    too much alike at the sensors.
     """
-    test, mass, poles = problem.measurement, problem.formulation.mass, poles or poles_of(problem)
-    try:
-        end = ended(problem, _estimated(problem, poles, options, monitor), monitor, options.max_iterations)
-    except SolverError as error:
-        if problem.modal[0].of_records or poles.omega[-1] <= 2 * np.pi * test.freq[-1]:
-            raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
-        return modal_structure(problem, options, monitor, Poles(poles.omega[:-1], poles.ratios[:-1], poles.residual))
+    test, mass = problem.measurement, problem.formulation.mass
+    end, poles = _fitted(problem, options, monitor)
     # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
@@ -313,6 +298,21 @@ def modal_structure(
             "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "
             f"wrong, or the responses are not absolute accelerations ({error})"
         ) from None
+
+
+def _fitted(problem: Prepared, options: Modal, monitor: IterationMonitor) -> tuple[ModalFit, Poles]:
+    """Where IPOPT ends from the estimate, and its poles: without the last above the lines where shapes are alike.
+
+    Far above the lines they are so where they stand for something else, as a gain.
+    """
+    poles = poles_of(problem)
+    while True:
+        try:
+            return ended(problem, _estimated(problem, poles, options, monitor), monitor, options.max_iterations), poles
+        except SolverError as error:
+            if problem.modal[0].of_records or poles.omega[-1] <= 2 * np.pi * problem.measurement.freq[-1]:
+                raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+            poles = Poles(poles.omega[:-1], poles.ratios[:-1], poles.residual)
 
 
 def _in_band(problem: Prepared, end: ModalFit) -> tuple[Modes, ResidualModes, Array | None, Array | None]:
@@ -411,7 +411,7 @@ def _again(
     # Poles beyond the lines mean nothing by themselves, and several may be next to exchangeable.
     held = ~problem.of_structure(modes.omega[first])
     solved = lambda modal: solve_modes(  # noqa: E731
-        modal, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
+        modal, modes, free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds, held=held),
         unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
         max_iterations=max_iterations,
     )  # fmt: skip
@@ -421,26 +421,6 @@ def _again(
     if not near and residual_of(modal, found.modes) > far * residual_of(modal, modal.modes) + EXACT:
         found = solved(ModalEstimate.of_lines(modal.records))
     return replace(found, static=end.static)
-
-
-def _free_spectrum(
-    omega: Array, ratios: Array, pole: Integers, lower: float = 0.0, upper: float = np.inf, *, held: NDArray[np.bool_]
-) -> Spectrum:
-    """Frequencies without bounds and damping ratios, of each pole that is not held; modes of one pole share them."""
-
-    def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
-        # In units of the half-power half-width, by which frequencies are known; cut off where no step of use leads.
-        room = np.where(held, 0.0, np.inf)
-        shift = z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios)
-        with np.errstate(divide="ignore"):
-            low, high = (np.where(held, 0.0, np.log(limit / ratios)) for limit in (lower, upper))
-        loss = z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high)
-        shift, loss = ca.fmin(ca.fmax(shift, -1.0), 1.0), ca.fmin(ca.fmax(loss, -10.0), 10.0)
-        moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
-        # Entries of a scalar are a row.
-        return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
-
-    return spectrum
 
 
 def held_by_model(problem: Prepared, structure: Structure) -> Array:

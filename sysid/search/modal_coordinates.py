@@ -20,7 +20,7 @@ from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import IterationMonitor, NonlinearProgram
-from sysid.problem.matrices import assemble
+from sysid.problem.matrices import assemble, blocks_of_modes
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import End, add_unknowns, solve_modes
 from sysid.search.stated_masses import positive_part, stated_totals, to_stated_totals
@@ -151,11 +151,8 @@ def unknowns_of(problem: Prepared, modes: Modes, rigid: Array, start: Structure,
         size = np.outer(unit, unit)
         left = positive_part((rigid - gamma.T @ gamma) / size) * size
     G = geometry.rigid_body
-    M_SS = P.T @ P
-    M_S0 = P.T @ gamma - M_SS @ G
-    low = np.linalg.solve(np.linalg.cholesky(M_SS), M_S0)
-    M_00, K_SS = low.T @ low + left, (P.T * w**2) @ P
-    found = problem.values(assemble(M_SS, M_S0, M_00, K_SS, G, ratios=zeta, test=problem.measurement))
+    blocks = blocks_of_modes(P, gamma, w, G, left)
+    found = problem.values(assemble(*blocks, G, ratios=zeta, test=problem.measurement))
     at = problem.formulation.parts.damping
     found[at] = np.clip(found[at], problem.lower[at], problem.upper[at])  # IPOPT may leave bounds by its tolerance
     found[at.stop :] = x[at.stop :]

@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import (
-    ModalEstimate,
-    factor_of,
-    index_of,
-    residual_of,
-    scale_in,
-    theta_of,
-)
+from sysid.modal_analysis.modal_estimate import ModalEstimate, factor_of, index_of, residual_of, scale_in, theta_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
@@ -144,6 +137,32 @@ def solve_modes(
     if abs(counted - left) > EXACT:
         status = f"{status}, but the residual {left:.6g} of its end is {counted:.6g} when counted anew"
     return ModalFit(modes, values[4], of_all, of_accelerations, status, z.on_bounds(best), weights)
+
+
+def free_spectrum(
+    omega: Array,
+    ratios: Array,
+    pole: NDArray[np.intp],
+    lower: float = 0.0,
+    upper: float = np.inf,
+    *,
+    held: NDArray[np.bool_],
+) -> Spectrum:
+    """Frequencies without bounds and damping ratios, of each pole that is not held; modes of one pole share them."""
+
+    def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
+        # In units of the half-power half-width, by which frequencies are known; cut off where no step of use leads.
+        room = np.where(held, 0.0, np.inf)
+        shift = z.variable("frequency", np.zeros(omega.size), -room, room) * ca.DM(ratios)
+        with np.errstate(divide="ignore"):
+            low, high = (np.where(held, 0.0, np.log(limit / ratios)) for limit in (lower, upper))
+        loss = z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high)
+        shift, loss = ca.fmin(ca.fmax(shift, -1.0), 1.0), ca.fmin(ca.fmax(loss, -10.0), 10.0)
+        moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
+        # Entries of a scalar are a row.
+        return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
+
+    return spectrum
 
 
 def _rigid_mass(
@@ -336,7 +355,8 @@ def hessian_of(model: SpectraModel) -> NumpyFunction:
         plain, curved = model.slopes(model.unpack(theta), model.levels)
         return 2 * curved, -2 * plain.gradient
 
-    return NumpyFunction(size, [(size, size), (size, 1)], values)
+    column = ca.Sparsity.dense(size)
+    return NumpyFunction(values, [column], [ca.Sparsity.dense(size, size), column])
 
 
 def _derivatives(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -139,16 +139,10 @@ class FittedLaw:
         away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
         return self.likelier and away > beyond_chance(self.values.size)
 
-    def among(self, frequencies: Array, within: float = 0.1) -> FittedLaw:
-        """The law of the nearest mode of a structure, Hz; an `InputError` where none is `within` this share of it."""
+    def mode_among(self, frequencies: Array, within: float = 0.1) -> int | None:
+        """Number of the nearest of some modes, Hz, (m,); None where it is not `within` this share of the law's."""
         apart = np.abs(frequencies / self.frequency - 1)
-        k = int(np.argmin(apart))
-        if apart[k] > within:
-            raise InputError(
-                f"laws: the structure has no mode near {self.frequency:.4g} Hz, which the law is of (the nearest is "
-                f"{frequencies[k]:.4g} Hz): leave the law out (with_laws), or keep its mode"
-            )
-        return replace(self, mode=k)
+        return min(np.flatnonzero(apart <= within).tolist(), key=apart.__getitem__, default=None)
 
     def at(self, level: float) -> tuple[float, float]:
         """Frequency, Hz, and damping ratio at a level, m/s²."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped
 from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
-from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains, unturned
+from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, unturned
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -149,14 +150,11 @@ class Structure:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
         self._set_residual(residual or ResidualModes.none(self.n_sensors, self.n_base))
 
-        G = self.rigid_body_dofs
-        B = self.mass[:n, :n] @ G + self.mass[:n, n:]
-        rigid = np.vstack([G, np.eye(self.n_base)])
+        rigid = np.vstack([self.rigid_body_dofs, np.eye(self.n_base)])
         self.mode_shapes: Array = self.recovery @ self.normal_modes
-        self.participation: Array = self.normal_modes.T @ B
+        self.participation: Array = self.normal_modes.T @ (self.mass @ rigid)[:n]
         self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
         self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
-        self._coupling = B
 
     def _set_residual(self, residual: ResidualModes) -> None:
         theirs, ours = (len(residual.shapes), residual.participation.shape[1]), (self.n_sensors, self.n_base)
@@ -165,6 +163,10 @@ class Structure:
         if residual.coupling is not None:
             shaped_array("residual coupling", residual.coupling, residual.count, self.n + residual.count)
         self.residual = residual
+        # Frequencies, turns and loss of the modes without the answer of static residual ones.
+        self._turned: tuple[Array, Array, Array] = self._omega, np.eye(self.n), self.modal_damping_matrix
+        if residual.coupling is not None:
+            self._turned = unturned(self._omega, self.modal_damping_matrix, *residual.above(self.normal_modes))
 
     def with_residual(self, residual: ResidualModes) -> Structure:
         """The same structure with these residual modes in the place of its own."""
@@ -179,7 +181,13 @@ class Structure:
         return other
 
     def _set_laws(self, laws: Sequence[FittedLaw]) -> None:
-        self.laws = tuple(law.among(self.natural_frequencies) for law in laws)
+        self.laws: tuple[FittedLaw, ...] = ()
+        for law in laws:
+            mode = law.mode_among(self.natural_frequencies)
+            if mode is None:
+                what = f"the structure has no mode near {law.frequency:.4g} Hz, which the law is of"
+                raise InputError(f"laws: {what}: leave the law out (with_laws), or keep its mode")
+            self.laws += (replace(law, mode=mode),)
         twice = len({law.mode for law in self.laws}) < len(self.laws)
         refuse((twice, "laws: two of them are of one mode, the nearest in frequency: keep one"))
 
@@ -214,9 +222,8 @@ class Structure:
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Structure:
         """Structure from a dictionary that `to_tree` made, exact to the bit."""
-        beyond = tree.get("residual")  # structures of before have none
-        residual = None if beyond is None else ResidualModes(**beyond)
-        laws = laws_from_tree(tree.get("laws"))
+        residual = tree["residual"] and ResidualModes(**tree["residual"])
+        laws = laws_from_tree(tree["laws"])
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual, "laws": laws})
 
     @property
@@ -265,11 +272,8 @@ class Structure:
         -------
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
-        lines = check_frequencies(freq, increasing=False)
-        if self.residual.coupling is not None:
-            return np.asarray(np.tensordot(self._all_shapes, self._modal_model.motion(lines), 1), dtype=complex)
-        beyond = np.tensordot(self.residual.shapes, self.residual.motion(lines), 1)
-        return np.tensordot(self.recovery, self._relative(lines), 1) + beyond
+        motion = self._modal_model.motion(check_frequencies(freq, increasing=False))
+        return np.asarray(np.tensordot(self._all_shapes, motion, 1), dtype=complex)
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -285,14 +289,9 @@ class Structure:
         ndarray, complex, shape (d, d, n_freq)
             [force direction, base direction, line].
         """
-        lines, beyond = check_frequencies(freq, increasing=False), self.residual
-        if beyond.coupling is not None:
-            every = np.tensordot(self._modal_model.participation.T, self._modal_model.motion(lines), 1)
-            return np.asarray(every + self.rigid_body_mass[:, :, None], dtype=complex)
-        own = np.tensordot(self._coupling.T, self._relative(lines), 1)
-        others: ComplexArray = np.einsum("ki,kjf->ijf", beyond.participation, beyond.motion(lines))
-        others += own + self.rigid_body_mass[:, :, None]
-        return others
+        model = self._modal_model
+        of_modes = np.tensordot(model.participation.T, model.motion(check_frequencies(freq, increasing=False)), 1)
+        return np.asarray(of_modes + self.rigid_body_mass[:, :, None], dtype=complex)
 
     def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Absolute accelerations of the sensors in time, under a base acceleration given by samples.
@@ -377,13 +376,6 @@ class Structure:
         return ModalModel(np.concatenate([omega, beyond.omega]), loss, participation)
 
     @property
-    def _turned(self) -> tuple[Array, Array, Array]:
-        """Frequencies, turns and loss of the modes without the answer of static residual ones: `unturned`."""
-        if self.residual.coupling is None:
-            return self._omega, np.eye(self.n), self.modal_damping_matrix
-        return unturned(self._omega, self.modal_damping_matrix, *self.residual.above(self.normal_modes))
-
-    @property
     def _all_shapes(self) -> Array:
         """The same modes at the sensors, (n_sensors, n + r)."""
         return np.hstack([self.mode_shapes @ self._turned[1], self.residual.shapes])
@@ -450,18 +442,6 @@ class Structure:
             damping=scipy.linalg.block_diag(loss, base),
             recovery=np.hstack([self._all_shapes if residual_vectors else self.mode_shapes, self.rigid_body]),
         )
-
-    def _relative(self, freq: Array) -> ComplexArray:
-        """Relative acceleration of the degrees of freedom, (n, d, n_freq)."""
-        omega = 2 * np.pi * freq
-        if self.modal_damping:
-            g = modal_gains(omega, self._omega, self.damping_ratios)
-            return (self.normal_modes[:, None] * self.participation.T) @ g
-        n = self.n
-        w = omega[:, None, None]
-        dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]
-        answer = np.linalg.solve(dynamic, w**2 * self._coupling)
-        return np.moveaxis(answer, 0, -1).astype(complex, copy=False)
 
     def _set_damping(self, ratios: ArrayLike | None, matrix: ArrayLike | None) -> None:
         n = self.n

@@ -14,8 +14,7 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.fit import fit_modes, whole_fit
-from sysid.modal_analysis.model_order import Peak
-from sysid.modal_analysis.model_order import _with as with_peak
+from sysid.modal_analysis.model_order import Peak, with_peak
 from sysid.modal_analysis.record_fit import on_turned
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import calibration_of

@@ -109,7 +109,7 @@ class TestRecords:
         np.testing.assert_array_equal(test.force[0], records["force"][0])
 
     @pytest.mark.parametrize(
-        "std", [0.5, [1, 2, 3, 4, 5], np.arange(4)[:, None], np.arange(3)[:, None, None], np.ones((3, 4, 5))]
+        "std", [0.5, [1, 2, 3, 4, 5], np.arange(1, 5)[:, None], np.arange(1, 4)[:, None, None], np.ones((3, 4, 5))]
     )
     def test_standard_deviations_broadcast(self, records, std):
         test = Measurement(**records, response_std=std, force_std=0.25)

@@ -49,6 +49,16 @@ def test_no_sample_weighs_a_million_times_more_than_the_middle_one():
     np.testing.assert_allclose(weight[:, [0, 2]], 1.0, rtol=1e-9)
 
 
+def test_a_deviation_of_zero_among_others_is_no_statement():
+    """As of a function that is zero at one line: else that line alone would weigh as much as all others."""
+    std = np.full(SHAPE, 0.5)
+    std[0, 1, 3] = 0.0
+    test = sysid.Measurement(
+        np.arange(1.0, 8.0), np.ones((2, 1, 7)), np.ones(SHAPE), rigid_body=np.ones((3, 1)), response_std=std
+    )
+    assert np.all(test.response_std == 0.5)
+
+
 class TestNoiseFromRest:
     def test_levels_are_those_of_the_noise_beside_offset_and_drift(self):
         rng, rate, n = np.random.default_rng(5), 100.0, 20_000

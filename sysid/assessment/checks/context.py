@@ -16,6 +16,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.noise_levels import quietest
 from sysid.modal_analysis.outliers import Outlier
+from sysid.modal_analysis.response import misfits, records_of
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -80,19 +81,14 @@ def _misses(problem: Prepared, structure: Structure, x: Array | None, alone: lis
 
 def _records(modal: ModalEstimate, structure: Structure) -> Iterator[JudgedRecord]:
     """Records of a test without its transients."""
-    test, noise = modal.records, modal.noise
-    left = test.relative - test.predict(structure)
-    quiet = _quiet_base(modal)
-    std = test.response_std
-    if std is not None and quiet is not None and noise is not None:
-        std = _bounded(modal, std, noise.response, left, quiet)
-    yield JudgedRecord("the accelerations", test.sensor_names, test.relative, left, std)
-    if test.force is not None:
-        axes = tuple(f"force {axis}" for axis in test.base_axes or ())
-        left, std = test.force - test.predict_force(structure), test.force_std
-        if std is not None and quiet is not None and noise is not None and noise.force is not None:
-            std = _bounded(modal, std, noise.force, left, quiet)
-        yield JudgedRecord(_FORCE, axes, test.force, left, std)
+    test, noise, quiet = modal.records, modal.noise, _quiet_base(modal)
+    names = ("the accelerations", test.sensor_names), (_FORCE, tuple(f"force {axis}" for axis in test.base_axes or ()))
+    levels = (None, None) if noise is None else (noise.response, noise.force)
+    every = zip(names, records_of(test), misfits(test, structure), levels, strict=False)
+    for (name, channels), (record, _), (left, std), level in every:
+        if std is not None and quiet is not None and level is not None:
+            std = _bounded(modal, std, level, left, quiet)
+        yield JudgedRecord(name, channels, record, left, std)
 
 
 def _quiet_base(modal: ModalEstimate) -> Array | None:

@@ -28,8 +28,7 @@ def _tones(modal: ModalEstimate, beyond: float = 6.0) -> Iterator[Finding]:
         return
     names = names_of_channels(test.sensors, test.rigid_body, test.base_axes)[test.n_base :]
     n = np.array(whole.samples)[:, None]
-    outputs = [part for part in (fit.test.response, fit.test.force) if part is not None]
-    power = np.sum(np.abs(np.concatenate(outputs, axis=1)) ** 2, axis=2)
+    power = np.sum(np.abs(fit.test.outputs) ** 2, axis=2)
     rms, noise = np.sqrt(2 * power) * whole.spacing[:, None], np.sqrt(fit.levels_of_runs[:, : power.shape[1]])
     for at, tone in enumerate(whole.tones):
         sine = fit.parameters.traces[..., 3 + 2 * at : 5 + 2 * at]

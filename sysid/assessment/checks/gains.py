@@ -22,6 +22,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gains_and_slopes, modes_above
+from sysid.structure.simulation import ModalModel
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
@@ -231,9 +232,8 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
     """
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
     if not structure.modal_damping:
-        zero, one = np.zeros((omega.size, omega.size)), np.eye(omega.size)
-        damping = structure.normal_modes.T @ structure.damping @ structure.normal_modes
-        s = np.linalg.eigvals(np.block([[zero, one], [-np.diag(omega**2), -damping]]))
+        own = ModalModel(omega, structure.modal_damping_matrix, structure.participation)
+        s = np.linalg.eigvals(own.state_matrix)
         fast, slow = np.sort(s[s.imag == 0].real).reshape(-1, 2).T  # any two real ones make the same functions
         omega = np.concatenate([np.abs(s[s.imag > 0]), np.sqrt(fast * slow)])
         ratios = -np.concatenate([s[s.imag > 0].real, (fast + slow) / 2]) / omega

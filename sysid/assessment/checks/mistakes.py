@@ -43,14 +43,6 @@ _UNITS = (  # what sensors over base are multiplied by, in words, and the units 
 _CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
 
 
-def is_gross(mistake: Finding) -> bool:
-    """True where no model of a form of its own fits a channel with it: a search in its unknowns is not worth its time.
-
-    A gain of one sensor may be fitted so far that the rest is of use.
-    """
-    return mistake.kind not in ("gain", "short segments")
-
-
 def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
     """Mistakes that a test shows by itself and its direct terms, the worst first; none where it cannot tell.
 
@@ -346,7 +338,9 @@ def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding,
     fitted = clocks[problem.misfit is not None :]
     found = of_tests([_of_test(prepared, declared, clock, first=clock is clocks[0]) for clock in fitted])
     every = tuple(found)
-    in_vain = [one.severity is Severity.BLOCKING or (is_gross(one) and not declared.free_modes) for one in every]
+    # A gain of one sensor may be fitted so far that the rest is of use.
+    fitted_all_the_same = lambda one: declared.free_modes or one.kind in ("gain", "short segments")  # noqa: E731
+    in_vain = [one.severity is Severity.BLOCKING or not fitted_all_the_same(one) for one in every]
     refuse(*zip(in_vain, map(str, every), strict=True))
     return every
 

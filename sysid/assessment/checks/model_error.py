@@ -258,11 +258,9 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     if not context.modal.laws:
         sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
         yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
-    for law in context.modal.laws:
-        try:
-            mode = law.among(context.end.structure.natural_frequencies, 0.25).mode + 1
-        except InputError:  # no mode of the answer
-            continue
+    frequencies = context.end.structure.natural_frequencies
+    near = [(law, law.mode_among(frequencies, 0.25)) for law in context.modal.laws]
+    for law, mode in ((law, k + 1) for law, k in near if k is not None):  # `judge` tells of the others
         low, high = law.levels
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
