@@ -74,7 +74,7 @@ CEILINGS = {
     # and delays that the first modes show (26),
     # and what a reading of all these mended (16),
     # less what stood twice, of outputs, misfits, structures of modes and callbacks (225).
-    "lines": 49_157,
+    "lines": 49_165,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.
