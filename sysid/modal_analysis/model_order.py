@@ -390,13 +390,16 @@ def without_spurious_modes(
     first, test = fit, fit.test
     if fit.static:  # new residues would be without them
         return fit
+    stay = np.arange(fit.model.m)
     while np.any(least := _spurious(fit)):
         # From new residues, a few steps: two modes close together may have cancelled each other.
-        modes = without(fit, least).modes
+        modes, stay = without(fit, least).modes, stay[~least]
         fit = record_modes(some or test, modes.omega, modes.ratios, monitor=monitor)
     if fit is first:
         return fit
-    fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
+    every = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
+    other = refitted(first, first.parameters.at(stay), some=some, monitor=monitor)
+    fit = max(every, other, key=lambda one: one.schwarz)
     return without_spurious_modes(fit, some=some, monitor=monitor)
 
 
