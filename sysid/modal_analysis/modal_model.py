@@ -92,41 +92,56 @@ class NormalEquations(NamedTuple):
         return self._replace(normal=self.normal[unknowns][:, unknowns], gradient=self.gradient[unknowns])
 
 
-class Layer(NamedTuple):
-    """One entry of each of some columns of a Jacobian: ``values[:, channel] * spectra[spectrum]``, (k,) and (k, c)."""
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns of a run's Jacobian by its spectra: sums of entries ``value * spectra[spectrum]`` of channels, (e,) each.
 
-    column: NDArray[np.intp]
-    spectrum: NDArray[np.intp]
-    values: Array
-
-
-class Columns(NamedTuple):
-    """Columns of a run's Jacobian by its spectra, each the sum of its entries in all layers.
-
-    `unknowns` (k,) are those that show in this run. The first layer has an entry of each.
+    `unknowns` (k,) are those that show in this run; `column` is which of these an entry is of. Each has one at least.
+    Without entries columns are summed channel by channel: what comes of their sums are products already.
     """
 
     unknowns: NDArray[np.intp]
-    layers: list[Layer]
+    channel: NDArray[np.intp]
+    column: NDArray[np.intp]
+    spectrum: NDArray[np.intp]
+    value: Array
+
+    @cached_property
+    def layers(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
+        """The same, all channels together (k, c), at most one of each column and, in the first, one of every column."""
+        width = int(self.spectrum.max()) + 1
+        places, at = np.unique(self.column * width + self.spectrum, return_inverse=True)
+        every = np.zeros((places.size, int(self.channel.max()) + 1))
+        every[at, self.channel] = self.value
+        starts, count = np.unique(places // width, return_index=True, return_counts=True)[1:]
+        layers = []
+        for depth in range(count.max()):
+            column = np.flatnonzero(count > depth)
+            entry = starts[column] + depth
+            layers.append((column, places[entry] % width, every[entry]))
+        return layers
 
     def seen(self, weights: ComplexArray, spectra: ComplexArray) -> ComplexArray:
         """Sums of all columns (k, L) over the channels, with weights (c, L)."""
-        first, *others = self.layers
-        out = real_times(first.values, weights)
-        out *= spectra[first.spectrum]
+        (_, first, every), *others = self.layers
+        out = real_times(every, weights)
+        out *= spectra[first]
         for column, spectrum, values in others:
             out[column] += real_times(values, weights) * spectra[spectrum]
         return out
 
     def products(self, sums: Sums, scale: Array) -> NormalEquations:
         """Products of the Jacobian from those of its spectra, for outputs of these inverse deviations, (c,)."""
+        if not self.value.size:
+            return NormalEquations(sums.gram, sums.cross, sums.chi2)
         normal, gradient = -sums.hidden, np.zeros(self.unknowns.size)
-        for column, spectrum, values in self.layers:
-            gradient[column] += np.sum(values * sums.cross[spectrum], axis=1)
-            if normal.size == 0:
-                continue
-            for other, beside, theirs in self.layers:
-                normal[np.ix_(column, other)] += (scale**2 * values) @ theirs.T * sums.gram[np.ix_(spectrum, beside)]
+        np.add.at(gradient, self.column, self.value * sums.cross[self.spectrum, self.channel])
+        for channel, size in enumerate(scale if normal.size else ()):
+            mine = self.channel == channel
+            at, row = np.unique(self.column[mine], return_inverse=True)
+            A = np.zeros((at.size, len(sums.gram)))
+            A[row, self.spectrum[mine]] = size * self.value[mine]
+            normal[np.ix_(at, at)] += A @ sums.gram @ A.T
         return NormalEquations(normal, gradient, sums.chi2)
 
 
@@ -147,14 +162,6 @@ class Sums(NamedTuple):
         return Sums(
             self.gram + other.gram, self.cross + other.cross, self.hidden + other.hidden, self.chi2 + other.chi2
         )  # fmt: skip
-
-
-class Summed(Columns):
-    """Columns that are summed channel by channel: what comes of their sums are products of the Jacobian already."""
-
-    def products(self, sums: Sums, scale: Array) -> NormalEquations:
-        """See `Columns`."""
-        return NormalEquations(sums.gram, sums.cross, sums.chi2)
 
 
 class Moves(NamedTuple):

@@ -20,7 +20,6 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import (
     FAR,
     Columns,
-    Layer,
     Lines,
     ModeLaw,
     Moves,
@@ -28,7 +27,6 @@ from sysid.modal_analysis.modal_model import (
     Parameters,
     Run,
     SpectralModel,
-    Summed,
     Sums,
     dots,
     pairs_of,
@@ -272,18 +270,8 @@ class Chunk(Lines):
         channels = range(self.records.channels)
         entries = [(np.full(row.size, at), row, *rest) for at in channels for row, *rest in self.entries(at)]
         channel, row, spectrum, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-        width = int(spectrum.max()) + 1
-        places, at = np.unique(row * width + spectrum, return_inverse=True)
-        row, spectrum = np.divmod(places, width)
-        every = np.zeros((places.size, len(channels)))
-        every[at, channel] = value
-        unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
-        layers = []
-        for depth in range(count.max()):
-            column = np.flatnonzero(count > depth)
-            entry = starts[column] + depth
-            layers.append(Layer(column, spectrum[entry], every[entry]))
-        return Columns(unknowns, layers)
+        unknowns, column = np.unique(row, return_inverse=True)
+        return Columns(unknowns, channel, column, spectrum, value)
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """Entries of the columns of a channel's Jacobian by the spectra: unknowns, spectra and values, (k,) each."""
@@ -368,7 +356,7 @@ class Chunk(Lines):
         weighed, root = self.weighed(levels), np.sqrt(self.run.weight)
         spectra = root * self.spectra(weighed.base)
         hidden, covered = np.zeros((columns.unknowns.size,) * 2), self.covered(levels).conj()
-        step = 1 + 2**19 // columns.unknowns.size  # lines, of which columns stay in a processor's cache
+        step = 1 + 2**16 // columns.unknowns.size  # lines, of which columns stay in a processor's cache
         for at in range(0, self.run.w.size, step):
             for part in covered[:, :, at : at + step]:
                 seen = columns.seen(part, spectra[:, at : at + step])
@@ -425,7 +413,8 @@ class SummedChunk(Chunk):
 
     def columns(self) -> Columns:
         """See `Chunk`."""
-        return Summed(np.arange(self.records.size), [])
+        none = np.zeros(0, np.intp)
+        return Columns(np.arange(self.records.size), none, none, none, np.zeros(0))
 
     def sums_of_errors(self, levels: Array, columns: Columns, error: ComplexArray | None = None) -> Sums:
         """See `Chunk`."""
