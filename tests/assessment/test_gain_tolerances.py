@@ -1,6 +1,7 @@
 """Gains within stated tolerances: what is taken off, what intervals hold, and who is named beyond them."""
 
 import dataclasses
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -257,3 +258,13 @@ def test_a_mode_that_stood_for_errors_of_gains_goes_with_them(records, monkeypat
     found = fit_modes(read)
     assert np.any(found.calibration.values)
     assert np.allclose(found.modes.omega, modes.omega, rtol=1e-4)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.007])
+def test_a_gain_is_beyond_a_stated_tolerance_at_a_chance_of_one_in_a_hundred_tests(tolerance):
+    std = 0.0005 if tolerance else 0.007
+    total = np.hypot(std, tolerance)
+    for chance in (3e-2, 3e-3, 3e-4):  # of one of eight sensors so far off, either way
+        off = NormalDist().inv_cdf(1 - chance / 16) * total
+        errors = GainErrors(np.r_[off, np.zeros(7)], np.full(8, std), np.zeros(8), 10**6, np.full(8, tolerance))
+        assert list(errors.wrong) == ([0] if chance < (1e-2 if tolerance else 1e-3) else [])
