@@ -435,7 +435,8 @@ def checked_deviations(
 ) -> Array | None:
     """Deviations of a record, of its shape; None where none are given.
 
-    A zero among others, as of a function that is zero at a line, tells no noise: the median stands in its place.
+    A zero among others, as of a function that is zero at a line, tells no noise: the median of its channel's other
+    lines stands in its place, or of the whole record where it has none.
     """
     if value is None:
         return None
@@ -448,4 +449,8 @@ def checked_deviations(
         raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
-    return np.where(full == 0, np.median(full[full > 0].tolist() or [0.0]), full)
+    told = full > 0
+    for channel in np.argwhere(np.any(~told, axis=-1)) if np.any(told) else []:
+        lines, known = full[*channel], told[*channel]
+        lines[~known] = np.median(lines[known] if np.any(known) else full[told])
+    return full

@@ -96,6 +96,8 @@ def with_couplings(
     monitor.doing = f"{m} modes and the dampers between them"
     # What modes above the lines leave would pass for couplings of those that stand for them.
     hidden = promised < score(equations, above)[0]
+    if hidden and (fit.static or not model.force):
+        return fit
     more = fit if hidden else _coupled(fit, p, fit.static, pruned, some, monitor)
     above_them = not fit.static and model.force and (hidden or misses_modes_above(more))
     if above_them:  # which dampers couple with those in the lines

@@ -203,7 +203,7 @@ def stored_fits(
 ) -> tuple[list[Delays], list[Calibration | None], list[RecordFit | None]]:
     """Delays and gains of the tests of a stored problem, and the fits of their whole records."""
     delays, gains = stored_delays(tree, tests), stored_calibrations(tree, tests)
-    given = zip(tree.get("fits") or [None] * len(tests), tests, delays, gains, strict=False)
+    given = zip((tree.get("fits") or [None] * len(tests))[: len(tests)], tests, delays, gains, strict=True)
     fits = [
         fit and RecordFit.from_tree(fit, without_delays(calibrated(test, gain), d.values))
         for fit, test, d, gain in given

@@ -222,8 +222,8 @@ class Structure:
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Structure:
         """Structure from a dictionary that `to_tree` made, exact to the bit."""
-        residual = tree["residual"] and ResidualModes(**tree["residual"])
-        laws = laws_from_tree(tree["laws"])
+        residual, laws = tree.get("residual"), laws_from_tree(tree.get("laws"))  # structures of before have none
+        residual = residual and ResidualModes(**residual)
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "residual": residual, "laws": laws})
 
     @property

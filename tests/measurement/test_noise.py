@@ -51,12 +51,12 @@ def test_no_sample_weighs_a_million_times_more_than_the_middle_one():
 
 def test_a_deviation_of_zero_among_others_is_no_statement():
     """As of a function that is zero at one line: else that line alone would weigh as much as all others."""
-    std = np.full(SHAPE, 0.5)
-    std[0, 1, 3] = 0.0
+    std = np.broadcast_to([[0.5], [500.0], [0.0]], SHAPE).copy()
+    std[0, 1, 3] = 0.0  # of the others of its channel; a channel without any takes those of the record
     test = sysid.Measurement(
         np.arange(1.0, 8.0), np.ones((2, 1, 7)), np.ones(SHAPE), rigid_body=np.ones((3, 1)), response_std=std
     )
-    assert np.all(test.response_std == 0.5)
+    np.testing.assert_array_equal(test.response_std, np.broadcast_to([[0.5], [500.0], [0.5]], SHAPE))
 
 
 class TestNoiseFromRest:
