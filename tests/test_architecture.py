@@ -78,7 +78,7 @@ CEILINGS = {
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 77.2,  # modes left out: 0.1, modes of laws one by one: 0.2, delays of the first modes: 0.1, a reading: 0.2
+    "branches": 77.2,  # modes left out: 0.1, laws one by one: 0.2, delays of first modes: 0.1, a reading: 0.2
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
