@@ -223,10 +223,9 @@ def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
     And for those that drift makes: of less than two periods a record, or of four below the lines.
     """
     modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
-    first, last = 2 * np.pi * fit.test.freq[[0, -1]]
-    below, narrow = modes.omega < first, (modes.ratios * modes.omega < RAZOR * line) & (modes.omega <= last)
+    below = modes.omega < 2 * np.pi * fit.test.freq[0]
     slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
-    return np.asarray((modes.ratios >= DAMPED) | narrow | slow)
+    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
 
 
 def least_worth(model: RecordModel) -> float:
