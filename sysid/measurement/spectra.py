@@ -449,8 +449,8 @@ def checked_deviations(
         raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
     if np.any(full < 0):
         raise InputError(f"{name} holds negative entries")
-    told = full > 0
-    for channel in np.argwhere(np.any(~told, axis=-1)) if np.any(told) else []:
-        lines, known = full[*channel], told[*channel]
-        lines[~known] = np.median(lines[known] if np.any(known) else full[told])
+    known = full > 0
+    for channel in np.argwhere(np.any(~known, axis=-1)) if np.any(known) else []:
+        lines, some = full[*channel], known[*channel]
+        lines[~some] = np.median(lines[some] if np.any(some) else full[known])
     return full

@@ -120,9 +120,9 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
         return fit
     monitor.doing = "least squares"
     plain = replace(fit, test=replace(fit.test, whole=replace(whole, varying=None, plain=True)))
-    own = replace(without(fit, np.arange(fit.model.m) >= fit.model.m - fit.static), coupling=None)  # no dampers
+    first = replace(without(fit, np.arange(fit.model.m) >= fit.model.m - fit.static), coupling=None)  # no dampers
     try:
-        squares = refitted(plain, own, monitor=monitor, static=0)
+        squares = refitted(plain, first, monitor=monitor, static=0)
         if left > 1.0:
             squares = min((squares, *_anew(plain, monitor)), key=left_of)
     except (Stop, KeyboardInterrupt):

@@ -15,7 +15,7 @@ from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped
 from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
-from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, unturned
+from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains, unturned
 from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
@@ -150,11 +150,14 @@ class Structure:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
         self._set_residual(residual or ResidualModes.none(self.n_sensors, self.n_base))
 
-        rigid = np.vstack([self.rigid_body_dofs, np.eye(self.n_base)])
+        G = self.rigid_body_dofs
+        B = self.mass[:n, :n] @ G + self.mass[:n, n:]
+        rigid = np.vstack([G, np.eye(self.n_base)])
         self.mode_shapes: Array = self.recovery @ self.normal_modes
-        self.participation: Array = self.normal_modes.T @ (self.mass @ rigid)[:n]
+        self.participation: Array = self.normal_modes.T @ B
         self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
         self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
+        self._coupling = B
 
     def _set_residual(self, residual: ResidualModes) -> None:
         theirs, ours = (len(residual.shapes), residual.participation.shape[1]), (self.n_sensors, self.n_base)
@@ -272,8 +275,11 @@ class Structure:
         -------
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
-        motion = self._modal_model.motion(check_frequencies(freq, increasing=False))
-        return np.asarray(np.tensordot(self._all_shapes, motion, 1), dtype=complex)
+        lines = check_frequencies(freq, increasing=False)
+        if self.residual.coupling is not None:
+            return np.asarray(np.tensordot(self._all_shapes, self._modal_model.motion(lines), 1), dtype=complex)
+        beyond = np.tensordot(self.residual.shapes, self.residual.motion(lines), 1)
+        return np.tensordot(self.recovery, self._relative(lines), 1) + beyond
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -289,9 +295,14 @@ class Structure:
         ndarray, complex, shape (d, d, n_freq)
             [force direction, base direction, line].
         """
-        model = self._modal_model
-        of_modes = np.tensordot(model.participation.T, model.motion(check_frequencies(freq, increasing=False)), 1)
-        return np.asarray(of_modes + self.rigid_body_mass[:, :, None], dtype=complex)
+        lines, beyond = check_frequencies(freq, increasing=False), self.residual
+        if beyond.coupling is not None:
+            every = np.tensordot(self._modal_model.participation.T, self._modal_model.motion(lines), 1)
+            return np.asarray(every + self.rigid_body_mass[:, :, None], dtype=complex)
+        own = np.tensordot(self._coupling.T, self._relative(lines), 1)
+        others: ComplexArray = np.einsum("ki,kjf->ijf", beyond.participation, beyond.motion(lines))
+        others += own + self.rigid_body_mass[:, :, None]
+        return others
 
     def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
         """Absolute accelerations of the sensors in time, under a base acceleration given by samples.
@@ -442,6 +453,16 @@ class Structure:
             damping=scipy.linalg.block_diag(loss, base),
             recovery=np.hstack([self._all_shapes if residual_vectors else self.mode_shapes, self.rigid_body]),
         )
+
+    def _relative(self, freq: Array) -> ComplexArray:
+        """Relative acceleration of the degrees of freedom, (n, d, n_freq), exact to round-off."""
+        omega = 2 * np.pi * freq
+        if self.modal_damping:
+            g = modal_gains(omega, self._omega, self.damping_ratios)
+            return (self.normal_modes[:, None] * self.participation.T) @ g
+        n, w = self.n, omega[:, None, None]
+        dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]
+        return np.moveaxis(np.linalg.solve(dynamic, w**2 * self._coupling), 0, -1).astype(complex, copy=False)
 
     def _set_damping(self, ratios: ArrayLike | None, matrix: ArrayLike | None) -> None:
         n = self.n
