@@ -14,7 +14,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.structure.superelement import modal_gains
 from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
@@ -33,10 +32,7 @@ class ModalModel(NamedTuple):
 
     def motion(self, freq: Array) -> ComplexArray:
         """Modal accelerations at lines in Hz per unit base acceleration, (n, d, n_freq)."""
-        w, loss = 2 * np.pi * freq[:, None, None], np.diag(self.damping)
-        if not np.any(self.damping - np.diag(loss)):
-            g = modal_gains(w.ravel(), self.omega, loss / (2 * self.omega))
-            return np.asarray(self.participation[:, :, None] * g[:, None])
+        w = 2 * np.pi * freq[:, None, None]
         dynamic = np.diag(self.omega**2) - w**2 * np.eye(self.omega.size) + 1j * w * self.damping
         return np.moveaxis(np.linalg.solve(dynamic, w**2 * self.participation + 0j), 0, -1)
 
