@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.measurement.clocks import without_delays
@@ -25,19 +24,17 @@ from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import (
     least_worth,
-    no_modes,
     peaks_of,
+    pruned,
     with_further_modes,
     with_static_modes,
     without_spurious_modes,
+    without_weak_modes,
 )
 from sysid.modal_analysis.record_fit import (
     ROUGH,
-    WHOLE,
-    Limits,
     RecordFit,
     at_all_lines,
-    joint_worth,
     on_all_lines,
     on_turned,
     record_modes,
@@ -175,9 +172,9 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
             fit = on_turned(fit, without_delays(test, np.where(certain, delays, 0.0)), monitor=monitor)
+        return without_weak_modes(fit, monitor)
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
-    return fit
 
 
 def _first_delays(
@@ -219,11 +216,8 @@ def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
             raise
         raise InputError(sentence) from error
     _refuse_sines(fit, test)
-    monitor.doing = "levels of noise that vary"
-    fit = with_varying_levels(fit, monitor=monitor)
-    if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
-        fit = _pruned(fit, monitor)
-    return fit
+    monitor.doing = "levels of noise that vary"  # where the level was too low, noise passed for modes
+    return without_weak_modes(with_varying_levels(fit, monitor=monitor), monitor)
 
 
 def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
@@ -256,12 +250,12 @@ def _rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
 def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
     """One mode at each pole, roughly, without those that noise explains; further ones at a pole show in its errors."""
     monitor.doing = f"{poles.omega.size} modes"
-    return _pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
+    return pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
 
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
     """The fit with couplings, then further modes that are worth it, without spurious ones; `some` as in `refitted`."""
-    fit = with_couplings(fit, lambda rough: _pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
+    fit = with_couplings(fit, lambda rough: pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
     monitor.keep(fit)
     if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
         return fit  # levels and shares do not explain what is left, and further modes would take long
@@ -283,7 +277,7 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
         last = 2 * np.pi * fit.test.freq[-1]
         if _same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
             return beside
-    fit = _pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
+    fit = pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
     return fit
 
@@ -294,28 +288,6 @@ def _same_modes(modes: Modes, poles: Poles | Modes) -> bool:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
     return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
-
-
-def _pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
-    """The fit without modes that noise explains, several together where noise explains them all."""
-    while np.any(least := _least(fit)):
-        fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
-    return fit
-
-
-def _least(fit: RecordFit) -> NDArray[np.bool_]:
-    """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
-    rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
-    value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
-    value[m - fit.static :] = np.inf
-    first, *others = np.argsort(value, kind="stable")
-    gone = (np.arange(m) == first) & (value < least) & (m - fit.static > 1)
-    for k in others[:-1]:
-        more = gone | (np.arange(m) == k)
-        if value[k] >= least or rise(more) >= least:
-            break
-        gone = more
-    return gone
 
 
 def fit_modes(
@@ -401,7 +373,7 @@ def _calibrated(
     """
     found = calibration_of(fit, stated)
     try:
-        calibrated = _pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor)
+        calibrated = pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor)
         if calibrated.model.m < fit.model.m:
             return _calibrated(on_turned(calibrated, fit.test, monitor=monitor), stated, monitor)
         return calibrated, found
@@ -464,7 +436,7 @@ def _early_laws(
         return None
     try:
         with monitor.at_work():
-            more = _pruned(with_further_modes(found, monitor=monitor), monitor)
+            more = pruned(with_further_modes(found, monitor=monitor), monitor)
     except (Stop, KeyboardInterrupt):
         return replace(found, stopped=True)
     omega, first = more.parameters.modes.omega, more.parameters.laws[0].mode

@@ -25,6 +25,8 @@ from sysid.modal_analysis.modal_model import Lines
 from sysid.modal_analysis.record_fit import (
     ROUGH,
     TRIAL,
+    WHOLE,
+    Limits,
     RecordFit,
     half_inverse,
     joint_worth,
@@ -445,3 +447,44 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
 def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Array:
     """Misfit about a line in its block, in units of the noise, one at least, (L,)."""
     return np.concatenate([np.full(lines.size, max(1.0, power[lines].mean() / channels)) for lines in blocks])
+
+
+def pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
+    """The fit without modes that noise explains, several together where noise explains them all."""
+    while np.any(least := _least(fit)):
+        fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
+    return fit
+
+
+def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, few: float = 100.0) -> RecordFit:
+    """The fit without modes that noise explains once all else has settled.
+
+    What one of two close together is worth shows without it only, when the other has moved.
+    """
+    while True:
+        fit = pruned(fit, monitor)
+        modes, value, least = fit.parameters.modes, worth(fit), least_worth(fit.model)
+        value[np.arange(value.size) >= value.size - fit.static] = np.inf
+        apart = np.abs(np.log(modes.omega / modes.omega[:, None])) / (2 * modes.ratios)
+        value[np.sort(apart, axis=0)[1:2].min(axis=0, initial=np.inf) > near] = np.inf
+        if np.min(value) >= few * least:
+            return fit
+        fewer = refitted(fit, without(fit, np.arange(value.size) == np.argmin(value)), monitor=monitor)
+        if not fewer.settled or fit.likelihood - fewer.likelihood >= least:
+            return fit
+        fit = fewer
+
+
+def _least(fit: RecordFit) -> NDArray[np.bool_]:
+    """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
+    rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
+    value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
+    value[m - fit.static :] = np.inf
+    first, *others = np.argsort(value, kind="stable")
+    gone = (np.arange(m) == first) & (value < least) & (m - fit.static > 1)
+    for k in others[:-1]:
+        more = gone | (np.arange(m) == k)
+        if value[k] >= least or rise(more) >= least:
+            break
+        gone = more
+    return gone

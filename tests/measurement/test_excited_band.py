@@ -126,6 +126,14 @@ def test_short_records_have_a_band_of_their_lines(n):
     assert sysid.excited_band([(base, base, None)], RATE) == (test.freq[0], test.freq[-1])
 
 
+def test_too_few_lines_of_records_are_refused():
+    base = np.random.default_rng(0).standard_normal((1, 200))
+    for high in (10.0, 11.0):
+        test = sysid.Measurement.from_time([(base, 2 * base, None)], RATE, rigid_body=[[1.0]], band=(10.0, high))
+        with pytest.raises(sysid.InputError, match="lines from 10 to .* are too few"):
+            sysid.identify(sysid.Problem(test))
+
+
 def test_a_base_at_rest_and_no_records_are_no_accident():
     still = np.zeros((1, 100))
     assert sysid.excited_band([(still, still, None)], RATE) == pytest.approx((1.0, 40.0))

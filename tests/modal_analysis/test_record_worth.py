@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import Run
-from sysid.modal_analysis.model_order import peaks_of, trials_of
+from sysid.modal_analysis.model_order import least_worth, peaks_of, pruned, trials_of, without_weak_modes
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
 
@@ -13,19 +14,19 @@ RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths
 
 
-def two_runs(force):
-    """Two runs of three storeys with 2 % noise; the second stands still at both ends."""
-    rng = np.random.default_rng(3)
+def two_runs(force, seed=3, noise=0.02, n=2):
+    """Runs of three storeys with noise of all channels; the second stands still at both ends."""
+    rng = np.random.default_rng(seed)
     K = np.array([[5e3, -2e3, 0, -3e3], [-2e3, 4e3, -2e3, 0], [0, -2e3, 2e3, 0], [-3e3, 0, 0, 3e3]])
     structure = sysid.Structure(np.diag([2.0, 1.5, 1.0, 1.0]), K, [0.01, 0.012, 0.02], n_base=1)
     runs = []
-    for _ in range(2):
+    for _ in range(n):
         base = rng.standard_normal((1, int(RATE * SECONDS)))
         clean = (base, structure.simulate(base, RATE), structure.simulate_force(base, RATE))
-        noisy = [one + 0.02 * np.std(one) * rng.standard_normal(one.shape) for one in clean]
+        noisy = [one + noise * np.std(one) * rng.standard_normal(one.shape) for one in clean]
         runs.append((*noisy[:2], noisy[2] if force else None))
     test = sysid.Measurement.from_time(
-        runs, RATE, rigid_body=np.ones((3, 1)), band=(1.0, 15.0), estimator="records", at_rest=[False, True]
+        runs, RATE, rigid_body=np.ones((3, 1)), band=(1.0, 15.0), estimator="records", at_rest=[False, True][:n]
     )
     return test, 2 * np.pi * structure.natural_frequencies
 
@@ -130,3 +131,16 @@ def test_the_likelihood_of_levels_is_that_of_covariances_written_out():
         information += [[np.trace(G @ a @ G @ b).real for b in slopes] for a in slopes]
     assert value == pytest.approx(made, rel=1e-12)
     np.testing.assert_allclose(fisher, information, rtol=1e-10)
+
+
+@pytest.mark.parametrize("seed, noise, near", [(5, 1e-3, 1.005), (32, 1e-3, 1.01)])
+def test_a_mode_that_its_neighbour_makes_look_worth_something_goes(seed, noise, near):
+    """Three modes and one close to the third: beside it the fourth explains much, and alone the third does."""
+    test, omega = two_runs(True, seed, noise, n=1)
+    fit = record_modes(test, np.append(omega, near * omega[2]), np.full(4, 0.012))
+    fit = refitted(fit, fit.parameters)
+    assert fit.settled and np.min(worth(fit)) > least_worth(fit.model) and pruned(fit, FitMonitor()) is fit
+    fewer = without_weak_modes(fit, FitMonitor())
+    np.testing.assert_allclose(np.sort(fewer.parameters.modes.omega), omega, rtol=1e-3)
+    assert fit.likelihood - fewer.likelihood < least_worth(fit.model)
+    assert without_weak_modes(fewer, FitMonitor()) is fewer
