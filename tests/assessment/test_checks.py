@@ -94,6 +94,11 @@ class TestDamping:
         assert result.determined and not result.contradictions
         (note,) = result.of_kind("damping")
         assert note.severity == "note" and note.numbers["deviations"] > 10
+        inverse = np.linalg.inv(truth.mass[:3, :3])
+        A = np.block([[np.zeros((3, 3)), np.eye(3)], [-inverse @ truth.stiffness[:3, :3], -inverse @ truth.damping]])
+        poles = np.unique(np.abs(np.linalg.eigvals(A)).round(9)) / (2 * np.pi)
+        np.testing.assert_allclose([note.numbers[f"pole {at}"] for at in (1, 2, 3)], poles, rtol=1e-3)
+        assert np.max(np.abs(poles / truth.natural_frequencies - 1)) > 3e-3  # which the table has
 
     def test_without_a_force_it_is_doubted_and_not_called_known(self):
         truth = building(dashpot=25.0)

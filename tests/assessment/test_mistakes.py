@@ -63,6 +63,20 @@ def test_mistakes_of_two_directions(change, kind, severity, channel, numbers):
         assert first.numbers[name] == pytest.approx(value, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    "test", [simulate(random_structure(1, n=3, d=1), np.linspace(0.5, 60, 400), rng=1), random_test()]
+)
+def test_a_channel_of_noise_alone_is_named_whatever_it_makes_of_the_misfit(test):
+    rng, response = np.random.default_rng(5), test.response.copy()
+    response[:, 1] = 1e-3 * np.std(response) * (rng.standard_normal((2, test.freq.size)).T @ [1.0, 1j])
+    dead = replace(test, response=response)
+    terms = direct_terms(dead)
+    for misfit in (terms.misfit, 0.7):  # of records in time each channel counts alike
+        assert [(one.kind, one.channel) for one in mistakes_of(dead, replace(terms, misfit=misfit))] == [
+            ("dropout", test.sensor_names[1])
+        ]
+
+
 def test_swapped_sensors_of_two_directions_are_told_without_any_model():
     test = random_test()
     order = [6, *range(1, 6), 0]

@@ -220,11 +220,16 @@ def _couplings(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
     values = found.values[*found.pairs.T]
     most = int(np.argmax(np.abs(values) / modal.coupling_std))
     (first, second), deviations = modal.omega[found.pairs[most]] / (2 * np.pi), values[most] / modal.coupling_std[most]
+    poles = sorted((one for one in np.linalg.eigvals(structure.to_state_space().A) if one.imag > 0), key=abs)[:6]
+    decays = ", ".join(f"{abs(one) / (2 * np.pi):.5g} ({-100 * one.real / abs(one):.3g} %)" for one in poles)
     yield Finding(
         "damping", Severity.NOTE,
         f"the damping is not classical: dampers couple the modes, by {100 * share:.2g} % of the response, most surely "
-        f"those at {first:.4g} and {second:.4g} Hz ({abs(deviations):.2g} deviations); the damping matrix holds it",
-        numbers={"share": share, "deviations": float(abs(deviations)), "first": float(first), "second": float(second)},
+        f"those at {first:.4g} and {second:.4g} Hz ({abs(deviations):.2g} deviations); the damping matrix holds it, "
+        "and frequencies and ratios in the table are those of M, K and the diagonal of C: free motion decays at its "
+        f"poles, {decays} Hz",
+        numbers={"share": share, "deviations": float(abs(deviations)), "first": float(first), "second": float(second),
+                 **{f"pole {at}": float(abs(one) / (2 * np.pi)) for at, one in enumerate(poles, 1)}},
     )  # fmt: skip
 
 

@@ -51,7 +51,8 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
     if terms is None:
         return []
     if terms.misfit > CONJUGATED:
-        return list(_conjugated(test, terms))
+        still = [] if terms.below else [one for one in _of_motion(test, terms) if one.kind == "dropout"]
+        return [*_conjugated(test, terms), *still]
     if terms.below:
         return []
     return [*_of_motion(test, terms), *_of_force(test, terms)]
@@ -264,6 +265,9 @@ def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
             f"{name} is relative to the base, where the other sensors are absolute: {seen} by {factor:.2g} times what "
             "rigid_body says"
         )
+    elif abs(factor) < _NONE:
+        kind, remedy = "dropout", "mend its cable or range, or leave it out"
+        sentence = f"{name} records nothing of the motion: {seen} by {factor:.2g} times what rigid_body says"
     elif factor >= _NONE:
         kind, remedy = "gain", f"divide its record by {factor:.3g}, or correct its row of rigid_body"
         sentence = (
