@@ -217,7 +217,7 @@ REFUSED = {
     ),
     "a module that is gone": (
         lambda: requests.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", UNTRUSTED),
-        "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
+        "out/result.h5 names the problem module {here}/gone.py, which is not here: get and name it: "
         "--module FILE.py",
     ),
     "an edited module": (
@@ -334,7 +334,7 @@ COMMANDS = {
     "run": "PROBLEM is missing (see 'sysid run --help')",
     "run --resume out": "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there, and goes on with "
     "it where there is one",
-    "run idle.py --resume out --fresh": "--resume and --fresh exclude each other",
+    "run idle.py --resume out --fresh": "--resume excludes --fresh and --out",
     "run shear_building --goal 0.1": "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for "
     "a test that 'sysid read' wrote",
     "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
@@ -671,7 +671,7 @@ def test_what_a_file_leaves_open_is_remarked(here):
     )
     said = {"base_axes": "x", "frf": "transmissibility", "frequency": "w", "convention": "exp(+iwt)"}
     assert reading.gather(Path("frf.npz"), said | {"sensor": [top | {"column": "h1"}]}).remarks == (
-        "frf.npz: 1 line within the half-power width of its sharpest peak, too few for its damping: export finer lines "
+        "frf.npz: 1 line in the half-power width of its sharpest peak, too few for its damping: export finer lines "
         "(longer blocks)",
         "frf.npz: array 'w': frequencies have no unit, and are taken as Hz", "spectra follow exp(+iwt), as stated",
     )  # fmt: skip

@@ -18,12 +18,10 @@ from sysid.results.storage import atomically
 def run(options: argparse.Namespace, out: Output) -> int:
     """Read, tell, write."""
     target = Path(options.out or "test.h5")
+    read = target.absolute() in [Path(file).absolute() for file in options.files]
     refuse(
         (target.suffix != ".h5", f"--out {target}: give a name that ends in .h5, which 'sysid run' knows"),
-        (
-            any(Path(file).absolute() == target.absolute() for file in options.files),
-            f"--out {target} is a file to read",
-        ),
+        (read, f"--out {target} is a file to read"),
     )
     test = gather(options.files, _said(options))
     with atomically(target) as temporary:

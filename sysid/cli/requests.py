@@ -80,9 +80,7 @@ def check_trust(recipe: Recipe, source: Path, instead: str, options: argparse.Na
     file = catalogue.file_of(recipe.module)
     place = shown(recipe.module) if file is None else file.absolute()
     if file is not None and not file.exists():
-        raise InputError(
-            f"{source} names the problem module {place}, which is not here: get it, and name it: {instead}"
-        )
+        raise InputError(f"{source} names the problem module {place}, which is not here: get and name it: {instead}")
     raise InputError(
         f"{source} names the problem module {place}, whose code would run: say {TRUST} where you know what stands in "
         f"it, or name the module yourself: {instead}"
@@ -114,21 +112,24 @@ def is_test(name: str | None) -> bool:
 
 def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
-    names = ("lumped", "mass", "band", "goal", "gain_std", "at_rest", "amplitude")
-    said = {name: getattr(options, name) for name in names}
-    extra = {name: value for name, value in said.items() if value is not None}
+    extra = _of_tests(options)
     if not is_test(given.module):
-        refuse(
-            (
-                extra,
-                "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for a test that "
-                "'sysid read' wrote",
-            )
-        )
+        words = "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for a test that"
+        refuse((extra, f"{words} 'sysid read' wrote"))
         return given
-    refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
+    twice = [name for name in extra if name in given.parameters]
+    refuse(
+        (twice, f"parameter {', '.join(map(repr, twice))} is set twice"),
+        (given.data is not None, f"--data {given.data}: {given.module} is the data already"),
+    )
     recorded_test.load(given.module)  # told before anything is made
     return replace(given, module=_MODULE, data=given.module, parameters={**given.parameters, **extra})
+
+
+def _of_tests(options: argparse.Namespace) -> dict[str, Any]:
+    """What is said by the options that are for tests."""
+    names = ("lumped", "mass", "band", "goal", "gain_std", "at_rest", "amplitude")
+    return {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
 def tell_excited_band(recipe: Recipe, out: Output) -> None:
@@ -151,10 +152,7 @@ def folder_of(options: argparse.Namespace, out: Output) -> Path:
     """The folder of results that the arguments of ``run`` ask for."""
     if options.resume is None:
         return results_folder(options.out, Path("results") / _name(_asked(options, out).recipe))
-    refuse(
-        (options.fresh, "--resume and --fresh exclude each other"),
-        (options.out is not None, "--resume and --out exclude each other"),
-    )
+    refuse((options.fresh or options.out is not None, "--resume excludes --fresh and --out"))
     return results_folder(options.resume, Path(options.resume))
 
 
@@ -168,10 +166,8 @@ def requested_run(options: argparse.Namespace, folder: Path, out: Output) -> Run
     search = _asked(options, out)
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
-        raise InputError(
-            f"{folder} holds {_in_words(checkpoint, search)}: '{resuming_command(search, folder)}' goes on with it, "
-            "--fresh begins anew, --out DIR writes elsewhere"
-        )
+        words = f"{folder} holds {_in_words(checkpoint, search)}: '{resuming_command(search, folder)}' goes on with it,"
+        raise InputError(f"{words} --fresh begins anew, --out DIR writes elsewhere")
     return search
 
 
@@ -221,9 +217,9 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunReque
     refuse((tree["begun"] is None, elsewhere))
     search = RunRequest.from_tree(tree["begun"])
     given = (options.seed, options.strategy, options.refine_by, options.data, options.modes)
-    more = any(one is not None for one in given) or bool(options.settings or options.dofs)
+    more = any(one is not None for one in given) or bool(options.settings or options.dofs or _of_tests(options))
     if asked is None:
-        kept = "--seed, --strategy, --refine-by, --modes, --dofs, --data and --set"
+        kept = "--seed, --strategy, --refine-by, --modes, --dofs, --data, --set and those of tests"
         refuse((more, f"--resume takes {kept} from the run in {folder}: {search}"))
         check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:

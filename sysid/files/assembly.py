@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,6 +40,8 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
         Where roles or axes are not said, a column or a rate is missing, a unit is unknown or of something else.
     """
     said, remarks = described(recordings, said)
+    spectral = [word for word in ("frf", "convention", "window", "averages") if getattr(said, word)]
+    refuse((spectral, f"{said.place}: {', '.join(spectral)}: said of spectra, and the files hold records in time"))
     axes = base_directions(said)
     runs, table, rates, of_base = [], [], [], list[tuple[BaseSensor, ...]]()
     for recording in recordings:
@@ -50,16 +53,18 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
         table += rows
         plain = [column for column in _time_columns(recording, said) if not column.unit]
         remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
+        with contextlib.suppress(InputError):  # where the file tells no rate
+            told = recorded_rate(recording, replace(said, sample_rate=None))
+            words = f"{recording.path} tells {told:g} Hz, and the {rates[-1]:g} Hz that are stated are taken"
+            remarks += [words] * (abs(told / rates[-1] - 1) > 0.01)
         parts = list(zip(said.channels, records, strict=True))
         runs.append(run_of(parts, said, axes, str(recording.path)))
         moving = [(channel, record - record.mean()) for channel, record in parts]  # an offset is no motion
         of_base.append(base_differences(moving, said, axes, str(recording.path)))
         remarks += _differences_in_words(of_base[-1], axes, str(recording.path))
-    if max(rates) - min(rates) > 1e-6 * max(rates):
-        raise InputError(
-            f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
-            f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
-        )
+    slow, fast = (recordings[int(at(rates))].path for at in (np.argmin, np.argmax))
+    words = f"{fast} is sampled at {max(rates):g} Hz and {slow} at {min(rates):g} Hz: bring them to one rate, or read"
+    refuse((max(rates) - min(rates) > 1e-6 * max(rates), f"{words} them apart"))
     remarks += [*delays_in_words(said), *work_of_force(*_spectra(runs, rates[0])), *_ends(runs, said, axes)]
     return RecordedTest(
         tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks),
@@ -113,9 +118,7 @@ def described(recordings: Sequence[Recording], said: Description) -> tuple[Descr
         on a base that turns.
     """
     recording = recordings[0]
-    words = (
-        f"which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file (--sensors FILE.toml)"
-    )
+    words = f"which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file (--sensors FILE)"
     words += ", or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid read --help' shows "
     refuse((not said.channels, f"{recording.path}: {words}such a file"))
     channels, remarks = [], []
@@ -123,9 +126,7 @@ def described(recordings: Sequence[Recording], said: Description) -> tuple[Descr
         named = [column for column in recording.columns if column.name == str(channel.column)]
         column = named[0] if named else recording.column(channel.column)
         axis = channel.axis or column.axis
-        words = (
-            f"axis is missing, and {recording.path} does not tell it: x, y, z, a sign before it where it points back"
-        )
+        words = f"axis is missing, and {recording.path} does not tell it: x, y, z, a sign first where it points back"
         refuse((not axis, f"{said.place}, sensor {at} (column {channel.column}): {words}, or a vector"))
         other = column.axis and isinstance(axis, str) and axis.lstrip("+") != column.axis
         conflict = f"the file says axis {column.axis}, the description {axis}, which is taken"
@@ -174,9 +175,7 @@ def tolerances_of(said: Description, axes: Sequence[str]) -> dict[str, Any]:
 def base_directions(said: Description, channels_needed: bool = True) -> tuple[str, ...]:
     """Names of the base's directions: stated, or those of the base channels, which functions per base motion lack."""
     base = [channel for channel in said.channels if channel.role == "base"]
-    along = (
-        'along which axes does the base move? State base_axes, such as "x" (--base-axes x), or the base\'s own channels'
-    )
+    along = 'along which axes does the base move? State base_axes, such as "x" (--base-axes x), or channels of the base'
     absent = not any(channel.role == "response" for channel in said.channels)
     refuse(
         (channels_needed and not base, f'{said.place}: no sensor has role = "base": the motion of the table is needed'),
@@ -196,11 +195,11 @@ def recorded_rate(recording: Recording, said: Description) -> float:
     column = next(iter(_time_columns(recording, said)), None)
     if column is None:
         rate = said.sample_rate or recording.sample_rate
+        words = (
+            f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in Hz'
+        )
         if rate is None or not 0 < rate < np.inf:
-            raise InputError(
-                f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in '
-                f"Hz (--time, --rate); {recording.in_words()}"
-            )
+            raise InputError(f"{words} (--time, --rate); {recording.in_words()}")
         return rate
     place, known = f"{recording.path}, {column.place}", units.find(column.unit or "s")
     if known is None or known.quantity != "time":
@@ -254,10 +253,8 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
     known = units.unit(text, place)
     force, turns = channel.role == "force", isinstance(channel.axis, str) and "r" in channel.axis
     wanted = _QUANTITIES[force, turns]
-    unlike = (
-        f"the file says {column.unit!r} and the description {channel.unit!r}: mend one of them, or leave unit out of"
-    )
-    words = f"{text!r} is a {known.quantity}, and a {channel.role} sensor along {channel.axis} gives a {wanted}"
+    unlike = f"the file says {column.unit!r} and the description {channel.unit!r}: mend one, or leave unit out of"
+    words = f"{text!r} measures {known.quantity}, and a {channel.role} sensor along {channel.axis} reads {wanted}"
     refuse(
         (units.find(column.unit) not in (None, known), f"{place}: {unlike} the description"),
         (known.quantity != wanted, f"{place}: {words}{'; sysid takes accelerations in time' * (not force)}"),
@@ -314,9 +311,7 @@ def base_differences(
 def _differences_in_words(read: Sequence[BaseSensor], axes: Sequence[str], place: str) -> list[str]:
     """A remark on what `base_differences` found."""
     each = ", ".join(f"{one.name!r} {one.gain:.4g} times (off by {100 * one.off:.2g} %)" for one in read)
-    words = (
-        f"{place}: {len(read)} base sensors along {' '.join(axes)} read the motion that is taken for that of the base"
-    )
+    words = f"{place}: {len(read)} base sensors along {' '.join(axes)} read the motion taken for that of the base"
     return [f"{words}: {each}"] * bool(read)
 
 

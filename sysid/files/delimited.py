@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import math
 import re
 from collections import Counter
@@ -22,7 +23,8 @@ _BLANKS = re.compile(r"[ \t]+")
 _DIGITS = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _COMPLEX = re.compile(rf"\(?\s*({_DIGITS})\s*([+-])\s*\+?({_DIGITS})\s*\*?\s*[ij]\s*\)?")
 _DATE = r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}"
-_CLOCK = re.compile(rf"(?:{_DATE}[ T]\s*)?(?:(\d{{1,2}}):)?(\d{{1,2}}):(\d{{2}}(?:\.\d*)?)\s*([AaPp][Mm]|Z)?")
+_ZONE = r"[AaPp][Mm]|Z|[+-]\d\d:?\d\d"
+_CLOCK = re.compile(rf"(?:{_DATE}[ T]\s*)?(?:(\d{{1,2}}):)?(\d{{1,2}}):(\d{{2}}(?:\.\d*)?)\s*({_ZONE})?")
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Form:
     def fields(self, line: str) -> list[str]:
         """The fields of a line, without blanks and quotes around them."""
         parts = _BLANKS.split(line.strip()) if self.delimiter == " " else line.split(self.delimiter)
+        if '"' in line and self.delimiter != " ":  # a delimiter within quotes is none
+            parts = next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True))
         return [part.strip().strip('"').strip() for part in parts]
 
     def numbers(self, fields: list[str]) -> list[complex] | None:
@@ -85,7 +89,9 @@ def read_delimited(path: Path) -> list[Recording]:
         body, remarks = body[:-1], [f"line {number}, the last, is cut short and left out"]
     table = table_of(body, form, width, path)
     values = [column if np.any(column.imag) else column.real for column in table.T]
-    names, given = _header([row for _, row in rows[:first]], width)
+    # NumPy, MATLAB and others write a sign of comments before the header.
+    heads = [form.fields(re.sub(r"^\s*[#%]\s*(?=[^\W\d])", "", lines[number - 1])) for number, _ in rows[:first]]
+    names, given = _header(heads, width, bool(np.all(np.isnan(values[-1]))))
     kept = [at for at in range(width) if not (names[at] == "" and np.all(np.isnan(values[at])))]
     places = [f"column {at + 1} ({name or 'no name'})" for at, name in enumerate(names)]
     lines_of = np.array([number for number, _ in body])
@@ -120,9 +126,7 @@ def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[Form, int
     filled = [line for line in lines if line.strip()]
     middle = filled[len(filled) // 3 :][:looked_at]
     best, score = None, (0, 0)
-    for delimiter, comma in product(";\t,| ", (False, True)):
-        if comma and delimiter == ",":
-            continue
+    for delimiter, comma in product(";\t,| ", (False, True)):  # quotes may hold decimal commas beside commas
         form = Form(delimiter, comma)
         rows = [form.fields(line) for line in middle]
         widths = Counter(len(row) for row in rows if form.numbers(row) is not None and any(row))
@@ -153,12 +157,12 @@ def table_of(body: list[tuple[int, list[str]]], form: Form, width: int, path: Pa
     return np.array(table)
 
 
-def _header(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
+def _header(rows: list[list[str]], width: int, empty_end: bool) -> tuple[list[str], list[str]]:
     """Names and units of the columns from the lines above the numbers, those next to them first."""
     names, given = [""] * width, [""] * width
     for row in reversed(rows):
-        # A trailing delimiter may stand under the header and not under the numbers.
-        fields = row[:width] if not any(row[width:]) else row
+        # A trailing delimiter may stand behind the header and not behind the numbers, or the other way.
+        fields = (row + [""] * empty_end)[:width] if not any(row[width:]) else row
         if len(fields) != width or not any(fields):
             break
         bare = [field.strip("[]() ") for field in fields]

@@ -168,7 +168,7 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         whole_number(f"{place}: averages", averages, at_least=2)
     join, align = (flag(f"{place}: {name}", given.get(name, False)) for name in ("join", "align"))
     for name in ("time", "frequency"):
-        wrong = given.get(name) is not None and not isinstance(given[name], str | int)
+        wrong = given.get(name) is not None and type(given[name]) not in (str, int)
         refuse((wrong, f"{place}: {name} must be the name or the number of a column, got {shown(given.get(name))}"))
     return Description(
         channels,
@@ -185,7 +185,7 @@ def _channel(entry: Any, place: str) -> Channel:
     for name in entry:
         refuse((name not in _FIELDS, f"{place}: {name!r} is unknown; known are {', '.join(_FIELDS)}"))
     column: Any = entry.get("column")
-    refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
+    refuse((type(column) not in (str, int) or column == "", f"{place}: column is missing (its name, or its number)"))
     place = f"{place} (column {printable(f'{place}: column', str(column))})"
     refuse(("role" not in entry, f"{place}: role is missing; give one of {str(ROLES)[1:-1]}"))
     choice(f"{place}: role", entry["role"], ROLES)

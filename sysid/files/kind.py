@@ -51,9 +51,7 @@ def coarse_lines(recording: Recording) -> list[str]:
         low, at = np.flatnonzero(~(size > np.max(size) / np.sqrt(2))), int(np.argmax(size))
         counts.append(int(min(low[low > at], default=size.size) - max(low[low < at], default=-1) - 1))
     fewest = min(counts, default=3)
-    words = (
-        "within the half-power width of its sharpest peak, too few for its damping: export finer lines (longer blocks)"
-    )
+    words = "in the half-power width of its sharpest peak, too few for its damping: export finer lines (longer blocks)"
     return [f"{recording.path}: {fewest} line{'s' * (fewest != 1)} {words}"] * (fewest < 3)
 
 

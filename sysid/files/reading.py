@@ -100,9 +100,7 @@ def _check_file(file: Path) -> None:
         (not file.is_file(), f"{file} is no file: a device or a pipe is not read"),
     )
     size = file.stat().st_size
-    words = (
-        f"{size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, .h5 or .npz,"
-    )
+    words = f"{size / 2**30:.1f} GiB of text, which takes ten times as much memory: export it as .mat, .h5 or .npz,"
     long = file.suffix.lower() in (*_TEXT, ".lvm", ".v2") and size > 2**30
     refuse((long, f"{file} has {words} or fewer channels or minutes a file"))
 

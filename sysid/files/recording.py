@@ -119,8 +119,8 @@ class Recording:
 
 
 def check_column(column: Column, path: Path) -> None:
-    """Refuse a column with a number that is NaN or infinite, with its place."""
-    bad = np.flatnonzero(~np.isfinite(column.values))
+    """Refuse a column with a number that is NaN, infinite or of no size that sensors read, with its place."""
+    bad = np.flatnonzero(~(np.abs(column.values) < 1e30))
     if bad.size:
         line = "" if column.lines is None else f" (line {column.lines[bad[0]]})"
         words = f"sample {bad[0] + 1} of {column.values.size}{line} is {column.values[bad[0]]} ({bad.size} such)"

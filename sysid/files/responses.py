@@ -202,9 +202,7 @@ def _check_responses(
     """Refuse functions of responses where that of a sensor is missing, and magnitudes alone."""
     given = {channel.name: values for channel, values in parts if channel.role == "response"}
     missing = next((sensor.name for sensor in sensors_of(said) if sensor.name not in given), None)
-    lacking = (
-        f"per unit of {reference or 'the reference'} the function of {missing!r} is missing: each sensor needs one"
-    )
+    lacking = f"per unit of {reference or 'the reference'} that of {missing!r} is missing: each sensor needs one"
     real = "its functions are real numbers, magnitudes it seems: export complex ones, or real and imaginary part, or"
     refuse(
         (
@@ -227,9 +225,7 @@ def _of_reference(recording: Recording, channel: Channel, reference: str, said: 
         and channel.reference in ("", reference)
     ]
     places = f"per unit of {reference or 'nothing'} ({', '.join(column.place for column in found)})"
-    words = (
-        f"{channel.column!r} stands there {len(found)} times {places}: two tests in one file? Export each into its own"
-    )
+    words = f"{channel.column!r} stands {len(found)} times {places}: two tests in one file? Export each into its own"
     refuse((len(found) > 1, f"{recording.path}: {words}"))
     if str(channel.column) not in recording.names:
         recording.column(channel.column)  # raises, with what there is
@@ -286,9 +282,7 @@ def _denominator(forms: Sequence[_Form], reference: str, recording: Recording) -
 
 def _unit_motion(lower: str, reference: str, axes: Sequence[str], recording: Recording, freq: Array) -> ComplexArray:
     """The base's acceleration that moves by one unit of the reference."""
-    per = (
-        f"functions are per unit of {lower or 'nothing'} ({reference or 'no reference'}), so that the base's own motion"
-    )
+    per = f"functions are per unit of {lower or 'nothing'} ({reference or 'no reference'}), so the base's own motion"
     words = f'{per} per unit of it is needed: describe its channels with role = "base"'
     refuse((lower not in _MOTIONS, f"{recording.path}: {words}"))
     at, sign = _direction(reference, axes, recording)
@@ -302,9 +296,7 @@ def _direction(reference: str, axes: Sequence[str], recording: Recording) -> tup
     match = _ENDS_WITH_AXIS.fullmatch(reference.strip().lower())
     only = axes[0] if len(axes) == 1 else ""
     sign, axis = match.groups() if match else ("", only)
-    words = (
-        f"the reference {reference!r} is none of the base's axes {' '.join(axes)}: state base_axes (--base-axes), or"
-    )
+    words = f"the reference {reference!r} is no axis of the base, {' '.join(axes)}: state base_axes (--base-axes), or"
     refuse((axis not in axes, f'{recording.path}: {words} reference = "x" with each function'))
     return list(axes).index(axis), float(f"{sign}1")
 

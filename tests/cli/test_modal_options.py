@@ -124,6 +124,7 @@ def test_numbers_of_modes_are_compared_up_to_those_within_the_lines(folder, file
         (["--modes", "1", "--dofs", "low,high"], "modes=1, and 2 sensors are named"),
         (["--modes", "2", "--strategy", "swarm"], "of the strategy 'modal', and 'swarm' is asked for"),
         (["--modes", "2", "--lumped", "--mass", "7.5"], "modes=2; with this mass there are 3"),
+        (["--mass", "7.5", "--set", "mass=3"], "parameter 'mass' is set twice"),
     ],
 )
 def test_a_mistake_is_one_line_with_status_2(folder, file, beside_progress, arguments, told):

@@ -14,7 +14,7 @@ from sysid.results.checkpoint import FILE_NAME, Checkpoint
 pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
 
-KEPT = "--resume takes --seed, --strategy, --refine-by, --modes, --dofs, --data and --set from the run in out"
+KEPT = "--modes, --dofs, --data, --set and those of tests from the run in out"
 
 
 @pytest.fixture
@@ -157,13 +157,14 @@ def test_a_module_that_the_state_names_runs_where_the_user_names_or_trusts_it(st
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--fresh"], "--resume and --fresh exclude each other"),
-        (["--out", "x"], "--resume and --out exclude each other"),
+        (["--fresh"], "--resume excludes --fresh and --out"),
+        (["--out", "x"], "--resume excludes --fresh and --out"),
         (
             ["--seed", "3"],
             KEPT,
         ),
         (["--modes", "2"], KEPT),
+        (["--mass", "2"], KEPT),
         (
             ["--set", "n=3"],
             KEPT,

@@ -74,6 +74,7 @@ def test_the_rate_of_a_short_record_is_that_of_its_times(tmp_path, rate):
     [
         ("Date;Time", lambda at: f"{at:%d.%m.%Y};{at:%H:%M:%S,%f}"),
         ("Date/Time", lambda at: f"{at:%m/%d/%Y %I:%M:%S.%f %p}"),
+        ("Timestamp", lambda at: f"{at:%Y-%m-%dT%H:%M:%S.%f}+01:00"),
         ("Elapsed time", lambda at: f"{at:%M:%S.%f}"),
     ],
 )
@@ -85,6 +86,29 @@ def test_times_of_day_have_dates_beside_them_halves_of_a_day_and_pass_midnight(t
     units = f"{';' * head.count(';')};g;mm/s²;kN"
     (tmp_path / "run.csv").write_text("\n".join([f"{head};table;top;force", units, *rows]), encoding="utf-8")
     assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(200, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows: ["# " + rows[2], *rows[3:]],
+        lambda rows: [*rows[:4], *(row + ";" for row in rows[4:])],
+        lambda rows: [",".join(f'"{field}"' for field in row.split(";")) for row in rows],
+        lambda rows: [*rows[:3], '"s";"g";"mm/s²";"kN"', *rows[4:]],
+    ],
+    ids=["sign of comments", "delimiter behind numbers", "decimal commas in quotes", "quotes"],
+)
+def test_a_header_is_found_whatever_programs_write_about_it(tmp_path, change):
+    (tmp_path / "run.csv").write_text("\n".join(change(table(";", True))), encoding="utf-8")
+    test = reading.gather(tmp_path / "run.csv", SENSORS)
+    np.testing.assert_allclose(np.vstack(test.runs[0]), records()[2], rtol=1e-10)
+
+
+def test_another_rate_than_the_file_tells_is_taken_and_told(tmp_path):
+    (tmp_path / "run.csv").write_text("\n".join(table()), encoding="utf-8")
+    test = reading.gather(tmp_path / "run.csv", {**SENSORS, "sample_rate": 100.0})
+    assert test.sample_rate == 100 and "200 Hz" in test.remarks[0] and "100 Hz" in test.remarks[0]
+    assert not any("200 Hz" in one for one in reading.gather(tmp_path / "run.csv", SENSORS).remarks)
 
 
 def test_units_in_brackets_and_a_cut_last_row(tmp_path):
@@ -107,12 +131,15 @@ def test_units_in_brackets_and_a_cut_last_row(tmp_path):
         (lambda rows: [], SENSORS, "is empty"),
         (lambda rows: rows, {}, "which column is which sensor is not said.*'table'.*--sensor"),
         (lambda rows: [rows[2], *rows[4:]], SENSORS, "no unit is stated: add unit"),
-        (lambda rows: [row.replace("kN", "mm") for row in rows], SENSORS, "'mm' is a displacement"),
+        (lambda rows: [row.replace("kN", "mm") for row in rows], SENSORS, "'mm' measures displacement"),
         (lambda rows: [row.replace("kN", "bananas") for row in rows], SENSORS, "'bananas' of .* is not known"),
         (lambda rows: [row.replace("top", "roof") for row in rows], SENSORS, "no column 'top': it has 4 columns"),
         (lambda rows: [row.replace("Zeit", "n") for row in rows], SENSORS, "no column of time.*sample_rate"),
         (lambda rows: rows, {"sensor": [{"column": "top", "role": "response"}]}, "sensor 1 .*axis is missing"),
         (lambda rows: rows, {"sensor": [{"column": "top", "axis": "x"}]}, "sensor 1 .*role is missing; give one of"),
+        (lambda rows: rows, {"sensor": [{"column": True, "axis": "x"}]}, "sensor 1: column is missing"),
+        (lambda rows: rows, {**SENSORS, "window": "hann", "averages": 9}, "window, averages: said of spectra"),
+        (lambda rows: [*rows[:50], "0,23;1e200;0;0", *rows[51:]], SENSORS, r"\(line 51\) is 1e\+200"),
     ],
 )
 def test_a_broken_table_is_told_in_words(tmp_path, change, said, words):
