@@ -75,8 +75,8 @@ CEILINGS = {
     # and what a reading of all these mended (16),
     # less what stood twice, of outputs, misfits, structures of modes and callbacks (200);
     # and modes that others close by or drift make look worth something, channels of noise alone, poles beside coupled
-    # damping, headers as more programs write them (5, beside what was taken away).
-    "lines": 49_203,
+    # damping, headers as more programs write them (7, beside what was taken away).
+    "lines": 49_205,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.

@@ -43,7 +43,7 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
     spectral = [word for word in ("frf", "convention", "window", "averages") if getattr(said, word)]
     refuse((spectral, f"{said.place}: {', '.join(spectral)}: said of spectra, and the files hold records in time"))
     axes = base_directions(said)
-    runs, table, rates, of_base = [], [], [], list[tuple[BaseSensor, ...]]()
+    runs, table, rates, of_base = list[Run](), [], [], list[tuple[BaseSensor, ...]]()
     for recording in recordings:
         rates.append(recorded_rate(recording, said))
         records, rows = _records(recording, said)
@@ -58,7 +58,11 @@ def assembled_in_time(recordings: Sequence[Recording], said: Description) -> Rec
             words = f"{recording.path} tells {told:g} Hz, and the {rates[-1]:g} Hz that are stated are taken"
             remarks += [words] * (abs(told / rates[-1] - 1) > 0.01)
         parts = list(zip(said.channels, records, strict=True))
-        runs.append(run_of(parts, said, axes, str(recording.path)))
+        run = run_of(parts, said, axes, str(recording.path))
+        twice = [one.path for one, other in zip(recordings, runs, strict=False) if np.array_equal(other[1], run[1])]
+        words = "holds the same records: a run that counts twice makes intervals too narrow"
+        remarks += [f"{recording.path}, beside {one}, {words}" for one in twice[:1]]
+        runs.append(run)
         moving = [(channel, record - record.mean()) for channel, record in parts]  # an offset is no motion
         of_base.append(base_differences(moving, said, axes, str(recording.path)))
         remarks += _differences_in_words(of_base[-1], axes, str(recording.path))

@@ -207,7 +207,7 @@ def _channel(entry: Any, place: str) -> Channel:
 
 def description_file(path: Path) -> Path | None:
     """A TOML file that stands beside a file: of its name, or ``sensors.toml`` in its folder."""
-    return next((near for near in (path.with_suffix(".toml"), path.parent / "sensors.toml") if near.is_file()), None)
+    return next((near for name in (path.stem, "sensors") if (near := path.parent / f"{name}.toml").is_file()), None)
 
 
 def asked(given: Any, paths: Sequence[Path]) -> Description:

@@ -296,7 +296,7 @@ def _direction(reference: str, axes: Sequence[str], recording: Recording) -> tup
     match = _ENDS_WITH_AXIS.fullmatch(reference.strip().lower())
     only = axes[0] if len(axes) == 1 else ""
     sign, axis = match.groups() if match else ("", only)
-    words = f"the reference {reference!r} is no axis of the base, {' '.join(axes)}: state base_axes (--base-axes), or"
+    words = f"the reference {reference!r} is no axis of the base ({' '.join(axes)}): state base_axes (--base-axes), or"
     refuse((axis not in axes, f'{recording.path}: {words} reference = "x" with each function'))
     return list(axes).index(axis), float(f"{sign}1")
 

@@ -120,7 +120,7 @@ def test_each_reference_is_a_run_with_its_own_base_motion(tmp_path):
         np.testing.assert_allclose(response, (H * B)[::-1], rtol=1e-12)
     for sensor in sensors[:3]:
         sensor["name"] += " of s1"
-    with pytest.raises(sysid.InputError, match=r"a\.npz: per unit of s1 the function of 'h3' is missing.*same name"):
+    with pytest.raises(sysid.InputError, match=r"a\.npz: per unit of s1 that of 'h3' is missing.*same name"):
         reading.gather(tmp_path / "a.npz", {"convention": "exp(+iwt)", "sensor": sensors})
 
 
@@ -150,7 +150,7 @@ def test_a_universal_file_tells_axes_positions_units_and_the_sign_of_its_referen
     "given, base_axes, words",
     [
         ({"orddenom_spec_data_type": 13}, "x", r"per unit of force \(100\+X\).*role = \"base\""),
-        ({"ref_dir": 2}, "x", r"reference '100\+Y' is none of the base's axes x"),
+        ({"ref_dir": 2}, "x", r"reference '100\+Y' is no axis of the base \(x\)"),
         ({"ordinate_spec_data_type": 13}, "x", "'mN / mm/s²' does not fit.*a response sensor gives a motion"),
         (
             {"ordinate_spec_data_type": 0, "orddenom_spec_data_type": 0},

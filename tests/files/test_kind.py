@@ -60,3 +60,11 @@ def test_what_is_missing_is_told_until_nothing_is(tmp_path, capsys):
     assert told(capsys, str(path))["missing"] == []
     assert cli.main(["doctor", str(tmp_path / "none.csv")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["doctor", "read"])
+def test_a_folder_is_no_file(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    for name in (".", "/"):
+        assert cli.main([command, name]) == 2
+        assert capsys.readouterr().err == f"sysid: {name} is a folder: name its files\n"

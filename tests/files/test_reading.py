@@ -111,6 +111,15 @@ def test_another_rate_than_the_file_tells_is_taken_and_told(tmp_path):
     assert not any("200 Hz" in one for one in reading.gather(tmp_path / "run.csv", SENSORS).remarks)
 
 
+def test_a_run_that_is_given_twice_is_told(tmp_path):
+    rows = table()
+    for name, lines in (("a", rows), ("b", [*rows[:4], *rows[5:]]), ("c", rows)):
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines), encoding="utf-8")
+    files = [tmp_path / f"{name}.csv" for name in "abc"]
+    (told,) = [one for one in reading.gather(files, SENSORS).remarks if "same records" in one]
+    assert told.startswith(f"{files[2]}, beside {files[0]}, ")
+
+
 def test_units_in_brackets_and_a_cut_last_row(tmp_path):
     heads = ("Time [s]", "table (g)", "top [mm/s^2]", "force [kN]")
     rows = [*table(",", False, heads, None), "2.0,0.1"]
