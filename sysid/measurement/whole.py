@@ -164,7 +164,7 @@ class WholeRecords:
         times, spacing = [], []
         for end in (taken.max(initial=0.0), taken.min(initial=0.0)):
             periods = 2 * last * abs(end)
-            count = int(np.ceil(periods)) + 2 if periods > 0.25 else 0
+            count = int(np.ceil(periods)) + 2 * (periods > 0.25) if periods > 0.02 else 0
             times.append(end * (np.arange(count) + 0.5) / max(count, 1))
             spacing.append(np.full(count, abs(end) / max(count, 1)))
         at, width = np.concatenate(times), np.concatenate(spacing)

@@ -10,6 +10,7 @@ from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous
 from benchmarks.records.simulated import Records, Run, four_storeys
 from sysid.measurement.clocks import without_delays
+from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles
 from sysid.modal_analysis.fit import whole_fit
@@ -194,3 +195,20 @@ def test_a_mode_close_above_the_lines_makes_no_channel_late():
     """Complex residues of poles in the lines stand for it, real ones beside terms without poles do not."""
     clean = draw(continuous(0), 2).measurement
     assert not find_delays(clean, beside_poles(clean))
+
+
+@pytest.mark.parametrize("periods", [0.05, 0.2, 0.249, 0.26, 0.9, 1.5])
+def test_traces_of_turned_records_hold_what_is_not_theirs_however_small_the_delay(periods):
+    """Sines at any frequencies, late and turned about, less the same on time; `periods` of half the last one."""
+    rng, rate, n, last = np.random.default_rng(0), 500.0, 3000, 40.0
+    frequencies, phases = rng.uniform(0.5, last, 80)[:, None], rng.uniform(0, 2 * np.pi, 80)[:, None]
+    record = lambda t: np.sin(2 * np.pi * frequencies * t + phases).sum(axis=0)  # noqa: E731
+    t, delay, freq = np.arange(n) / rate, periods / (2 * last), np.fft.rfftfreq(n, 1 / rate)
+    late, due = np.fft.rfft(record(t - delay)), np.fft.rfft(record(t))
+    lines = (freq > 0.5) & (freq <= last)
+    left = (late * np.exp(2j * np.pi * freq * delay) - due)[lines]
+    traces = WholeRecords((n,), rate, (False,)).earlier(np.array([delay])).traces(freq[lines], last)
+    A, b = np.hstack([traces.real, traces.imag]).T, np.hstack([left.real, left.imag])
+    A /= np.linalg.norm(A, axis=0)
+    assert np.linalg.cond(A) < 1e6
+    assert np.linalg.norm(b - A @ np.linalg.lstsq(A, b)[0]) < 0.005 * np.linalg.norm(b)
