@@ -26,7 +26,7 @@ def decimated_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -
     So many in a half-power width of a mode of this damping ratio; all of them where that would not save half.
     """
     keep, ends = np.zeros(test.freq.size, bool), f"{test.freq[0]:g} to {test.freq[-1]:g} Hz"
-    refuse((keep.size < 5, f"{keep.size} lines from {ends} are too few to tell any mode: add lines, or records"))
+    refuse((keep.size < 5, f"lines from {ends} ({keep.size}) are too few to tell any mode: add lines, or records"))
     for mask in test.own_lines:
         lines = np.flatnonzero(mask)
         step = np.gradient(test.freq[lines]) / test.freq[lines] * a_width / (2 * ratio)
