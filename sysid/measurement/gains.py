@@ -65,3 +65,8 @@ def without_gains(test: Measurement, errors: Array) -> Measurement:
         response_std=read(test.response_std, np.abs(sensors)), force_std=read(test.force_std, np.abs(force)),
         gain_std=np.zeros(n), base_gain_std=np.zeros(d), force_gain_std=np.zeros(d),
     )  # fmt: skip
+
+
+def without_constants(test: Measurement, errors: Array) -> Measurement:
+    """The test without the share of the base's motion that errors of its sensors' gains, (n_sensors,), add to it."""
+    return replace(test, response=test.response - errors[:, None] * (test.rigid_body @ test.base))

@@ -35,13 +35,13 @@ from sysid.modal_analysis.record_fit import (
     ROUGH,
     RecordFit,
     at_all_lines,
-    on_all_lines,
     on_turned,
     record_modes,
     refitted,
     without,
 )
 from sysid.modal_analysis.residual_tests import (
+    beside_free_gains,
     calibration_of,
     delays_left,
     delays_of,
@@ -85,7 +85,7 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
     of_noise = _whole_fit if delays is None else functools.partial(_on_one_clock, delays=delays)
 
     def fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
-        return _no_worse_than_squares(of_noise(test, monitor=monitor), monitor)
+        return beside_free_gains(_no_worse_than_squares(of_noise(test, monitor=monitor), monitor), _whole_fit, monitor)
 
     if monitor is None:
         return fit(test, monitor=FitMonitor())
@@ -231,7 +231,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         some = test.at(lines)
         fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
-        fit = on_all_lines(fit, test, monitor=monitor)
+        fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
         monitor.keep(fit)
         return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
     fit = _fitted(_rough_fit(test, monitor), monitor) if first is None else first

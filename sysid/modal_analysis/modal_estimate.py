@@ -20,7 +20,7 @@ from sysid.modal_analysis.response import columns, coupled_flexibility, gains, w
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import ROUND_OFF, round_off
+from sysid.structure.thresholds import ROUND_OFF, most_deviations, round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,11 @@ class Gains:
     moves: Array
     rigid: Array
     rigid_chi2: Array
+
+    @property
+    def certain(self) -> Array:
+        """Errors beyond chance, (n_sensors,); zero for the others."""
+        return np.where(np.abs(self.error) > most_deviations(self.error.size) * self.std, self.error, 0.0)
 
 
 class Excess(NamedTuple):

@@ -8,7 +8,7 @@ estimated in turn with the fit.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import refuse
+from sysid.measurement.gains import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -76,6 +77,8 @@ class RecordFit:
         Modes that the estimate has, where fewer were asked for than the records show.
     left_out : tuple of FittedLaw
         Laws of amplitude that were tried and do not hold.
+    constants : (n_sensors,) or (1,)
+        Errors of gains of which `without_constants` took what they add off the test, zero for none.
     """
 
     test: Measurement
@@ -87,6 +90,7 @@ class RecordFit:
     static: int = 0
     kept: NDArray[np.bool_] | None = None
     left_out: tuple[FittedLaw, ...] = ()
+    constants: Array = field(default_factory=lambda: np.zeros(1))
 
     @cached_property
     def model(self) -> RecordModel:
@@ -175,9 +179,7 @@ class RecordFit:
         found = self.levels_of_runs
         if self.model.whole.noise is None and not self.model.whole.grows:
             found = bounded_by_lines(self.model, found)
-        root, n, d = np.sqrt(found), self.test.n_sensors, self.test.n_base
-        if len(root) == 1:
-            root = root[0]
+        root, n, d = np.sqrt(found if len(found) > 1 else found[0]), self.test.n_sensors, self.test.n_base
         force = root[..., n : n + d] if self.test.force is not None else None
         return NoiseLevels(root[..., :n], root[..., -d:], force)
 
@@ -187,7 +189,7 @@ class RecordFit:
         return {
             "modes": p.modes._asdict(), "rigid": p.rigid, "ends": p.ends, "traces": p.traces, "levels": self.levels,
             "chi2": self.chi2, "settled": self.settled, "stopped": self.stopped, "static": self.static,
-            "varying": whole.varying, "kept": self.kept, "coupling": p.coupling,
+            "varying": whole.varying, "kept": self.kept, "coupling": p.coupling, "constants": self.constants,
             "left_out": laws_to_tree(self.left_out), "gains": p.gains, "plain": whole.plain, "grows": whole.grows,
             "profile": getattr(whole, "profile", None), "taken": whole.taken if whole.grows else None,
             "laws": [{**law._asdict(), "form": np.array(law.form)} for law in p.laws] or None,
@@ -209,13 +211,16 @@ class RecordFit:
                 refuse((wrong, "the stored fit of lines is of another test, or holds what is no number"))
             test = replace(test, whole=replace(of_lines, profile=profile, taken=taken))
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
+        constants = tree.get("constants", np.zeros(1))
+        sound = constants.shape in ((1,), (test.n_sensors,)) and bool(np.all(np.isfinite(constants)))
+        test = without_constants(test, constants) if sound else test
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
         ends, gains = tree["ends"], tree.get("gains", np.zeros(0))
         laws = tuple(ModeLaw(**{**law, "form": LawForm(*law["form"].tolist())}) for law in tree.get("laws") or ())
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
         ended = {name: tree[name] for name in ("levels", "chi2", "settled", "stopped", "static")}
-        fit = cls(test, p, **ended, kept=kept, left_out=laws_from_tree(tree.get("left_out")))
+        fit = cls(test, p, **ended, kept=kept, left_out=laws_from_tree(tree.get("left_out")), constants=constants)
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains, *(law.values for law in laws)]
         shapes: list[tuple[int, ...]] = [
@@ -223,7 +228,7 @@ class RecordFit:
             (test.n_runs, c, trace_count(test)), (len(model.runs), (c + model.d) * (1 + model.whole.grows)),
             (model.by_gains.shape[2],), *((law.form.size,) for law in laws),
         ]  # fmt: skip
-        sound = [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
+        sound &= [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
         sound &= all(law.mode in range(m) and law.sensor in range(model.n) for law in laws)
         sound &= all(law.equivalent.shape == (test.n_runs, 2) and bool(np.all(law.equivalent > 0)) for law in laws)
@@ -266,12 +271,7 @@ def refitted(
     fit = fit if static is None else replace(fit, static=static)
     coarse = None if some is None else fit.model_of(p, some).weighed_as_all()
     found = fit_model(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
-    return replace(found, left_out=fit.left_out)
-
-
-def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
-    """The fit of a test from that of some of its lines."""
-    return refitted(replace(fit, test=test), fit.parameters, some=fit.test, monitor=monitor)
+    return replace(found, left_out=fit.left_out, constants=fit.constants)
 
 
 def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:

@@ -268,3 +268,32 @@ def test_a_gain_is_beyond_a_stated_tolerance_at_a_chance_of_one_in_a_hundred_tes
         off = NormalDist().inv_cdf(1 - chance / 16) * total
         errors = GainErrors(np.r_[off, np.zeros(7)], np.full(8, std), np.zeros(8), 10**6, np.full(8, tolerance))
         assert list(errors.wrong) == ([0] if chance < (1e-2 if tolerance else 1e-3) else [])
+
+
+@pytest.mark.parametrize("wrong, channel", [(0, "sensor 1"), (4, "base x")], ids=["a sensor", "the base"])
+def test_poles_that_stand_for_a_wrong_gain_are_not_in_the_answer(records, plain, wrong, channel, tmp_path):
+    """The gain is told, and the modes are those of right records, of shapes as recorded."""
+    result = sysid.identify(Problem(misread(records, ERROR * np.eye(6)[wrong])), rng=0)
+    assert [(one.kind, one.channel) for one in result.contradictions] == [("gain", channel)]
+    constants, right = result.modal[0].record_fit.constants, plain["records"]
+    driven = np.arange(4) == wrong if wrong < 4 else np.full(4, True)
+    size = ERROR if wrong < 4 else 1 / (1 + ERROR) - 1
+    np.testing.assert_allclose(constants[driven], size, atol=0.2 * ERROR)
+    assert not np.any(constants[~driven])
+    np.testing.assert_allclose(
+        result.structure.natural_frequencies, right.structure.natural_frequencies, rtol=2e-5
+    )  # fmt: skip
+    factor = (1 + ERROR * driven if wrong < 4 else np.full(4, (1 + ERROR) ** -0.5))[:, None]
+    np.testing.assert_allclose(
+        np.abs(result.structure.mode_shapes), np.abs(factor * right.structure.mode_shapes), atol=0.003
+    )
+    result.save(tmp_path / "result.h5")
+    again = sysid.load(tmp_path / "result.h5")
+    np.testing.assert_array_equal(again.gains.error, result.gains.error)
+    np.testing.assert_array_equal(again.modal[0].records.response, result.modal[0].records.response)
+
+
+def test_right_gains_and_modes_below_the_lines_take_no_constants_off(records):
+    f = np.sort(frame().natural_frequencies)
+    for test in (records, records.at(records.freq > (f[0] + f[1]) / 2)):
+        assert not np.any(whole_fit(test).constants)

@@ -84,6 +84,19 @@ def test_wrong_gains_are_told_as_such(gains, channel):
     assert (told.kind in ("gain", "rigid motion"), told.channel) == (True, channel)
 
 
+@pytest.mark.parametrize("gain", [1.0, 1.02])
+def test_a_gain_of_one_base_axis_of_several_is_told_of_the_base(gain):
+    """Sensors move with both, so that the gain of none of them is off by as much."""
+    rows, w, rng = np.stack([np.ones(4), HEIGHTS], axis=1), 2 * np.pi * FREQ[:, None, None], np.random.default_rng(5)
+    dynamic = K - w**2 * np.diag(MASS) + 1j * w * (0.2 * np.diag(MASS) + 4e-4 * K)
+    clean = np.moveaxis(rows + np.linalg.solve(dynamic, w**2 * MASS[:, None] * rows), 0, -1) / [[1.0], [gain]]
+    std = NOISE * np.sqrt(np.mean(np.abs(clean) ** 2, axis=2, keepdims=True))
+    noisy = clean + std * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape)) / np.sqrt(2)
+    test = sysid.Measurement.from_frf(FREQ, noisy, response_std=std, sensors=sensors(), base_axes="x ry")
+    told = [(one.kind, one.channel, one.numbers["gain"]) for one in found(test) if one.severity == "contradicts"]
+    assert told == ([] if gain == 1 else [("gain", "base ry", pytest.approx(gain, abs=0.003))])
+
+
 def test_tolerances_of_gains_take_no_rotation_off():
     test = dataclasses.replace(spectra(0.08), gain_std=0.005)
     (told,) = [one for one in found(test) if one.severity == "contradicts"]

@@ -71,7 +71,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
     if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
-    gains = [] if rigid or errors is None else list(wrong_gains(test, errors))
+    gains = [] if rigid or errors is None else list(wrong_gains(test, errors, structure))
     found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):

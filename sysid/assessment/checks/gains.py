@@ -249,8 +249,8 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
     return omega[first], ratios[first]
 
 
-def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
-    """Gains that are wrong: of the base, or of single sensors, the worst first."""
+def wrong_gains(test: Measurement, errors: GainErrors, structure: Structure) -> Iterator[Finding]:
+    """Gains that are wrong: of the base, which explains those of sensors, or of single sensors, the worst first."""
     explained = np.zeros(test.n_sensors, bool)
     for axis, name in enumerate(test.base_axes):
         driven = _driven(test, axis)
@@ -258,6 +258,10 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
         if base is not None:
             explained |= driven
             yield _of_base(name, base, errors, driven)
+    judged = np.any(np.isfinite(errors.error)) and not np.any(errors.tolerance)
+    of_axes = list(_of_axes(test, structure)) if judged and not np.any(explained) else []
+    explained |= bool(of_axes)
+    yield from of_axes
     for i in [one for one in errors.wrong if not explained[one]][:MOST_OF_A_KIND]:
         error, name = float(errors.error[i]), test.sensor_names[i]
         yield Finding(
@@ -268,6 +272,16 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
             f"correct its axis or its row of rigid_body{_within(error)}", channel=name,
             numbers={"gain": 1 + error, "std": float(errors.std[i])},
         )  # fmt: skip
+
+
+def _of_axes(test: Measurement, structure: Structure) -> Iterator[Finding]:
+    """Gains of single base directions of several, by what all sensors move by along each beside their modes."""
+    for axis, name in enumerate(test.base_axes if test.n_base > 1 else ()):
+        along = np.where(np.arange(test.n_base) == axis, test.rigid_body, 0.0)
+        found = errors_along(test, distinct_poles(structure), along, velocity=not structure.modal_damping)
+        errors = found and GainErrors(*found, np.zeros(test.n_sensors))
+        if errors and (base := errors.of_base()):
+            yield _of_base(name, base, errors, np.isfinite(errors.error))
 
 
 def _within(error: float, usual: float = 0.015) -> str:

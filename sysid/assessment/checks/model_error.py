@@ -313,7 +313,8 @@ def changes(problem: Prepared) -> list[Change]:
     with_law = [law.frequency for law in problem.laws]  # what changes by a law is told there
     for k, (f, ratio) in enumerate(zip(modes.omega / (2 * np.pi), modes.ratios, strict=True)):
         width = 2 * ratio * f
-        if any(abs(f / one - 1) < _CLOSE for one in with_law):
+        beyond = not given.freq[0] <= f <= given.freq[-1]  # a pole there stands for what the lines hardly show
+        if beyond or any(abs(f / one - 1) < _CLOSE for one in with_law):
             continue
         seen = [one for part, named in zip(stretches, tests, strict=True) for one in _seen(part, k, width, *named)]
         change = Change(f, width, seen, scaled)

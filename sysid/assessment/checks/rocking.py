@@ -18,6 +18,7 @@ from sysid.assessment.checks.context import BEYOND, Context, of_tests
 from sysid.assessment.checks.gains import distinct_poles, errors_along, tolerated_errors
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
+from sysid.measurement.gains import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.vector_fitting import find_poles
@@ -85,6 +86,8 @@ def _found(modal: ModalEstimate, structure: Structure, suspected: bool, rounds: 
     others, unless the model misses more than noise (`suspected`).
     """
     test, errors = modal.records, tolerated_errors(modal)
+    if modal.record_fit is not None:  # rocking makes constants too, which a wrong gain stands for
+        test = without_constants(test, -modal.record_fit.constants)
     if test.sensors is None:
         return []
     rows, along = rigid_body(sensors=test.sensors, base_axes=BASE_AXES), np.zeros(test.rigid_body.shape)
