@@ -73,12 +73,13 @@ CEILINGS = {
     # and what blocks under Hann's window leak in all channels at once, in the moves of damping (43),
     # and delays that the first modes show (26),
     # and what a reading of all these mended (16),
+    # and laws of further modes by the level of the first, with derivatives, and squares beside them (125),
     # less what stood twice, of outputs, misfits, structures of modes and callbacks (200).
-    "lines": 49_198,
+    "lines": 49_323,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 77.3,  # modes left out: 0.2, laws one by one: 0.2, delays of first modes: 0.1, a reading: 0.2
+    "branches": 77.6,  # modes left out: 0.2, laws one by one: 0.2, by another level: 0.3, delays: 0.1, a reading: 0.2
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
