@@ -74,14 +74,15 @@ CEILINGS = {
     # and delays that the first modes show (26),
     # and what a reading of all these mended (16),
     # and wrong gains weighed against what stands for them, and those of one base axis of several (56),
+    # and laws of further modes by the level of the first, with derivatives, and squares beside them (125),
     # less what stood twice, of outputs, misfits, structures of modes and callbacks (200);
     # and modes that others close by or drift make look worth something, channels of noise alone, poles beside coupled
     # damping, headers as more programs write them (7, beside what was taken away).
-    "lines": 49_261,
+    "lines": 49_386,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 77.3,  # modes left out: 0.2, laws one by one: 0.2, delays of first modes: 0.1, a reading: 0.2
+    "branches": 77.6,  # modes left out: 0.2, laws one by one: 0.2, by another level: 0.3, delays: 0.1, a reading: 0.2
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

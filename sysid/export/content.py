@@ -193,12 +193,14 @@ def _level_in_words(content: Content) -> Iterator[str]:
     for law in it.structure.laws:
         mode, low, high = law.mode + 1, *law.levels
         frequency, ratio = law.at(level or 0.0)
+        whose = f"mode {law.level_of + 1}'s" if law.followed else "its"
         where = f"at {level:.6g} m/s2" if level is not None else "at rest"
         beyond = level is not None and not low <= level <= high
         yield (
-            f"level: mode {mode} follows its amplitude; these matrices are those {where} of its relative acceleration "
-            f"at {it.measurement.sensor_names[law.sensor]} ({frequency:.6g} Hz, damping ratio {ratio:.4g}); it was "
-            f"tested from {low:.3g} to {high:.3g} m/s2{', so that they are extrapolated' * beyond}; deviations are "
+            f"level: mode {mode} follows {whose} amplitude; these matrices are those {where} of {whose} relative "
+            f"acceleration at {it.measurement.sensor_names[law.sensor]} ({frequency:.6g} Hz, damping ratio "
+            f"{ratio:.4g}); it was tested from {low:.3g} to {high:.3g} m/s2"
+            f"{', so that they are extrapolated' * beyond}; deviations are "
             "those at rest"
         )
 

@@ -99,19 +99,25 @@ def _stages(
             break
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
+        noisy = best
         if left_of(best) < much:
             monitor.doing = "noise of all channels"
-            noisy = replace(best, test=replace(best.test, whole=replace(whole, plain=False)))
-            best, linear = (
-                refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, limits=limits, monitor=monitor)
-                for p, limits in ((_with_equivalents(best), WHOLE), (linear.parameters, TRIAL))
-            )
+            noisy = _with_noise(best, _with_equivalents(best), ROUGH, monitor)
+        if noisy is not best and left_of(noisy) < 1.1 * left_of(best):  # else noise of the base takes what laws miss
+            best = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
+            linear = _with_noise(best, linear.parameters, TRIAL, monitor)
             if not fit.model.whole.plain:  # what it explains by noise of the base may have taken many steps
                 linear = max(linear, fit, key=lambda one: one.likelihood)
     if plain or len(best.parameters.laws) > 1:
-        best, gone = _holding(best, linear, TRIAL if best.model.whole.plain else WHOLE, monitor)
+        best, gone = _holding(best, linear, limits if best.model.whole.plain else WHOLE, monitor)
         left_out += gone
     yield replace(best if best.parameters.laws else fit, left_out=tuple(left_out))
+
+
+def _with_noise(fit: RecordFit, p: Parameters, limits: Limits, monitor: FitMonitor) -> RecordFit:
+    """The fit from these parameters in place of squares with noise of all channels."""
+    noisy = replace(fit, test=replace(fit.test, whole=replace(fit.model.whole, plain=False)))
+    return refitted(replace(noisy, levels=rough_levels(noisy.model_of(p), p)), p, limits=limits, monitor=monitor)
 
 
 def _with_law_of(
@@ -125,12 +131,15 @@ def _with_law_of(
     first = before if exponents == "auto" else exponents
     started: list[RecordFit] = []
     for begun in _beginnings(best, omega, monitor):
+        if best.parameters.laws:
+            started.append(_started(*begun, first, (), limits, monitor))
         started.append(_started(*begun, first, tries, limits, monitor))
-        if started[-1].schwarz > best.schwarz:
+        if max(one.schwarz for one in started) > best.schwarz:
             break
     best = max(started, key=lambda one: one.schwarz)
     yield best
-    for number, each in enumerate((OF_FREQUENCY, OF_DAMPING) if exponents == "auto" else ()):
+    alone = best.parameters.laws[-1].level_of is None  # what follows another changes by the same cause
+    for number, each in enumerate((OF_FREQUENCY, OF_DAMPING) if exponents == "auto" and alone else ()):
         for exponent in (one for one in each if one != first[number]):
             monitor.doing = f"{which}, exponent {exponent:g} {LawForm._fields[number].replace('_', ' ')}"
             found = refitted(best, _with_exponent(best, number, exponent), limits=limits, monitor=monitor)
@@ -253,14 +262,26 @@ def _started(
     fit: RecordFit, mode: int, exponents: tuple[float, float], tries: tuple[float, ...], limits: Limits,
     monitor: FitMonitor,
 ) -> RecordFit:  # fmt: skip
-    """A law more of these exponents, from the first of some falls of the frequency that settles, else the likeliest."""
-    p, found = fit.parameters, []
-    sensor = int(np.argmax(np.abs(p.modes.phi[:, mode])))
-    form, followed = LawForm(*exponents, _levels(fit, mode, sensor)[1]), np.arange(fit.model.m) == mode
+    """A law more of these exponents, from the first of some falls of the frequency that settles, else the likeliest.
+
+    Without falls, one that follows the level of the first law, and changes as that does.
+    """
+    p, found, followed = fit.parameters, [], np.arange(fit.model.m) == mode
     ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
-    for fall in tries:
-        law = ModeLaw(mode, sensor, form, np.array([fall, 0.0]), np.ones((fit.test.n_runs, 2)))
-        modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + fall / 2, 1.0))
+    law = ModeLaw(
+        mode,
+        int(np.argmax(np.abs(p.modes.phi[:, mode]))),
+        LawForm(*exponents, 1.0),
+        np.zeros(2),
+        np.ones((fit.test.n_runs, 2)),
+    )
+    law = law._replace(form=law.form._replace(level=_levels(fit, law)[1]))
+    if not tries:
+        first = p.laws[0]
+        law = law._replace(sensor=first.sensor, form=first.form, values=first.values, level_of=first.followed)
+    for values in [np.array([fall, 0.0]) for fall in tries] or [law.values]:
+        law = law._replace(values=values)
+        modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + values[0] / 2, 1.0))
         begun = replace(p, modes=modes, ends=ends, laws=(*p.laws, law))
         found.append(refitted(fit, begun, limits=ROUGH, monitor=monitor))
         if found[-1].settled:
@@ -277,7 +298,7 @@ def _with_exponent(fit: RecordFit, number: int, exponent: float) -> Parameters:
     """
     p = _with_equivalents(fit)
     law, omega, ratios = p.laws[-1], p.modes.omega.copy(), p.modes.ratios.copy()
-    unit = np.quantile(np.concatenate(_envelopes(fit, law.mode, law.sensor)), (0.3, 0.95)) / law.form.level
+    unit = np.quantile(np.concatenate(_envelopes(fit, law.followed, law.sensor)), (0.3, 0.95)) / law.form.level
     values, pole = law.values.copy(), [1.0, 1.0]
     before, after = unit ** law.form[number], unit**exponent
     values[number] *= (before[1] - before[0]) / (after[1] - after[0])
@@ -300,7 +321,7 @@ def _shared(fit: RecordFit) -> float:
 def _with_equivalents(fit: RecordFit) -> Parameters:
     """The parameters with the linear mode of each run that is nearest to what its law does there.
 
-    Frequency and damping are means over the time, each weighed by the square of the level.
+    Frequency and damping are means over the time, each weighed by the square of the mode's own level.
     """
     p, laws = fit.parameters, []
     for law in p.laws:
@@ -309,16 +330,17 @@ def _with_equivalents(fit: RecordFit) -> Parameters:
         both = law.form.at(A, ca.SX(omega), ca.SX(ratio), ca.SX(ca.DM(law.values)))
         function = ca.Function("both", [A], [ca.horzcat(*both) / np.array([[omega, ratio]])])
         equivalent = []
-        for level in _envelopes(fit, law.mode, law.sensor):
+        levels = _envelopes(fit, law.followed, law.sensor)
+        for level, motion in zip(levels, _envelopes(fit, law.mode, law.sensor), strict=True):
             values = np.asarray(function.map(level.size)(level[None]).full()).reshape(2, -1, order="F")
-            equivalent.append(values @ level**2 / (level @ level))
+            equivalent.append(values @ motion**2 / (motion @ motion))
         laws.append(law._replace(equivalent=np.maximum(equivalent, 0.1)))
     return replace(p, laws=tuple(laws))
 
 
-def _levels(fit: RecordFit, mode: int, sensor: int, share: float = 0.05) -> tuple[float, float]:
-    """Level that a mode exceeds but for a `share` of the time, and its highest, m/s²."""
-    level = np.concatenate(_envelopes(fit, mode, sensor))
+def _levels(fit: RecordFit, law: ModeLaw, share: float = 0.05) -> tuple[float, float]:
+    """Level that the mode of a law's level exceeds but for a `share` of the time, and its highest, m/s²."""
+    level = np.concatenate(_envelopes(fit, law.followed, law.sensor))
     return float(np.quantile(level, share)), float(level.max())
 
 
@@ -348,6 +370,10 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         at = [*(start + law.mode for start in poles), *range(first, first + law.form.size)]
         first += law.form.size
         pole = float(p.modes.omega[law.mode] / (2 * np.pi)), float(p.modes.ratios[law.mode])
-        levels, cov = _levels(fit, law.mode, law.sensor), covariance[np.ix_(at, at)]
-        found.append(FittedLaw(*pole, law.sensor, law.form, law.values, levels, cov, law.likelier))
+        cov, other = covariance[np.ix_(at, at)], 0.0
+        if law.level_of is not None:
+            other = float(p.modes.omega[law.level_of] / (2 * np.pi))
+        found.append(
+            FittedLaw(*pole, law.sensor, law.form, law.values, _levels(fit, law), cov, law.likelier, followed=other)
+        )
     return tuple(found)

@@ -430,10 +430,10 @@ def _early_laws(
         found = with_laws(rough, stated, monitor=monitor, probe=True)
     except (InputError, np.linalg.LinAlgError):  # told by the whole fit
         return None
-    if found.stopped:
-        return found
-    if not found.parameters.laws or found.model.whole.plain:
+    if not found.stopped and (not found.parameters.laws or left_of(found) > much):
         return None
+    if found.stopped or found.model.whole.plain:  # of squares, what laws miss would make further modes
+        return found
     try:
         with monitor.at_work():
             more = pruned(with_further_modes(found, monitor=monitor), monitor)

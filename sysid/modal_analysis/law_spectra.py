@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import ModeLaw, Parameters, Run
+from sysid.modal_analysis.modal_model import ModeLaw, Parameters, Run, SpectralModel
 from sysid.modal_analysis.response import gains_and_slopes
 from sysid.structure.amplitude import motion
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -26,7 +26,8 @@ class LawMotions:
     """Motions of the modes that follow a law, of all runs of a test, and what they add to the linear ones.
 
     An addition, (6 + d + k, L), is that to the motion at the lines of a run, and its derivatives by two ends, d
-    participations, the logarithms of frequency, damping ratio and size of the shape, and the k numbers of the law.
+    participations, the logarithms of frequency, damping ratio and size of the shape, and the k numbers of the law; then
+    those by all these of the mode whose level counts, where it is another.
     Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for.
     """
 
@@ -55,45 +56,53 @@ class LawMotions:
 
     def added(self, p: Parameters, run: Run, law: int) -> ComplexArray:
         """What a law adds at the lines of a part of a run."""
-        return self.of_run(p, run.number, law)[:, run.among(self.lines[run.number])]
+        return self.of_run(p, run.number, p.laws[law])[:, run.among(self.lines[run.number])]
 
-    def of_run(self, p: Parameters, run: int, law: int) -> ComplexArray:
-        """What a law adds at all lines of a run; that of the last numbers of it is kept."""
-        one, modes = p.laws[law], p.modes
-        k, size = one.mode, modes.phi[one.sensor, one.mode]
-        times, series = self.in_time(run, k, float(modes.omega[k]))
-        beside = [k, times, *one.form, modes.omega[k], modes.ratios[k], size]
-        numbers = np.concatenate([modes.gamma[k], p.ends[k], one.values, one.equivalent[run], beside])
-        if (run, law) not in self._last or not np.array_equal(self._last[run, law][0], numbers):
-            self._last[run, law] = numbers, self._added(p, run, one, times, series)
-        return self._last[run, law][1]
-
-    def _added(self, p: Parameters, run: int, law: ModeLaw, times: int, series: Array) -> ComplexArray:
-        modes, k = p.modes, law.mode
-        d, rest = len(series), self.at_rest[run]
-        first = 2 * sum(not one for one in self.at_rest[:run])
-        ends = np.zeros(2) if rest else p.ends[k, first : first + 2]
-        gamma, omega, ratio = modes.gamma[k], modes.omega[k], modes.ratios[k]
-        numbers = np.concatenate([np.log([omega, ratio, abs(modes.phi[law.sensor, k])]), law.values])
-        step = 1 / (self.rate * times)
-        rows = motion(law.form, gamma @ series, step, numbers, ends[::-1], series)
-        spectra = np.fft.rfft(rows[:, ::times])[:, self.places(run)] / self.rate
-        w, base = 2 * np.pi * self.lines[run], self.base[run]
-        pole = np.array([[omega], [ratio]]) * law.equivalent[run][:, None]
+    def of_run(self, p: Parameters, run: int, law: ModeLaw) -> ComplexArray:
+        """What a law adds at all lines of a run."""
+        modes, k, d, rest = p.modes, law.mode, p.modes.gamma.shape[1], self.at_rest[run]
+        spectra = np.fft.rfft(self._moved(p, run, law)[0])[:, self.places(run)] / self.rate
+        w, base, ends = 2 * np.pi * self.lines[run], self.base[run], self._ends(p, run, k)
+        pole = np.array([[modes.omega[k]], [modes.ratios[k]]]) * law.equivalent[run][:, None]
         g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], *pole)
         transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
-        load = gamma @ base + ends @ transients
-        spectra[1:3] = np.zeros((2, w.size)) if rest else spectra[[2, 1]]
-        linear = [gamma @ base + g[0] * load, *g[0] * transients, *base + g[0] * base, by_omega * load, by_ratio * load]
-        spectra[: 5 + d] -= linear
+        load = modes.gamma[k] @ base + ends @ transients
+        for at in (1, 6 + d + law.form.size)[: 2 - (law.level_of is None)]:
+            spectra[at : at + 2] = np.zeros((2, w.size)) if rest else spectra[[at + 1, at]]
+        linear = [modes.gamma[k] @ base + g[0] * load, *g[0] * transients, *base + g[0] * base]
+        spectra[: 5 + d] -= [*linear, by_omega * load, by_ratio * load]
         return np.asarray(spectra)
+
+    def _moved(self, p: Parameters, run: int, law: ModeLaw) -> tuple[Array, Array]:
+        """Rows of `motion` at the samples of a run, and its level at all steps; those of the last numbers are kept."""
+        modes, k, level = p.modes, law.mode, None
+        times, series = self.in_time(run, k, float(modes.omega[k]))
+        if law.level_of is not None:  # straight from step to step of the mode that it is of
+            level, fine = self._moved(p, run, law.moving(p.laws))[1], np.arange(series.shape[1])
+            at = np.minimum(fine / fine.size * level.shape[1], level.shape[1] - 1.0)
+            first = at.astype(int)
+            rest = at - first
+            level = (1 - rest) * level[:, first] + rest * level[:, np.minimum(first + 1, level.shape[1] - 1)]
+        pole = np.log([modes.omega[k], modes.ratios[k], abs(modes.phi[law.sensor, k])])
+        numbers, ends = np.append(pole, law.values), self._ends(p, run, k)
+        key = np.concatenate([[times, *law.form], modes.gamma[k], ends, numbers, *(() if level is None else level[:2])])
+        if (run, k) not in self._last or not np.array_equal(self._last[run, k][0], key):
+            load, step = modes.gamma[k] @ series, 1 / (self.rate * times)
+            rows, levels = motion(law.form, load, step, numbers, ends[::-1], series, level)
+            self._last[run, k] = key, rows[:, ::times], levels
+        return self._last[run, k][1:]
+
+    def _ends(self, p: Parameters, run: int, mode: int) -> Array:
+        """Numbers of the ends of a run of a mode, (2,)."""
+        first = 2 * sum(not one for one in self.at_rest[:run])
+        return np.zeros(2) if self.at_rest[run] else p.ends[mode, first : first + 2]
 
 
 @functools.lru_cache(maxsize=1)
 def _motions_of(
     test: Measurement,
-) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int], tuple[Array, ComplexArray]]]:
-    """Motions of the base in time, by run and steps a sample, and last additions, by run and law: of all models."""
+) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int], tuple[Array, Array, Array]]]:
+    """Motions of the base in time, by run and steps a sample, and the last of modes, by run and mode: of all models."""
     return {}, {}
 
 
@@ -109,7 +118,7 @@ def linear_modes(p: Parameters, run: int) -> Modes:
 def add_laws(
     plain: ComplexArray, laws: Sequence[ModeLaw], added: Sequence[ComplexArray], shape: tuple[int, ...], *, ends: bool
 ) -> list[ComplexArray]:
-    """Add what laws add to the spectra of the linear modes, in place; give derivatives by size and law, law by law.
+    """Add what laws add to the spectra of the linear modes, in place; give all other derivatives, law by law.
 
     `shape`, (m, d), is that of participations; the spectra are those of `Lines.spectra`.
     """
@@ -129,18 +138,30 @@ def add_laws(
 
 
 def law_entries(
-    p: Parameters, of_shapes: int, of_laws: int, at: int, shapes: Array
+    model: SpectralModel, p: Parameters, laws: int, at: int, shapes: Array, ends: slice | None
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
     """Entries of a channel's columns by the spectra that `add_laws` gives, which begin at `at`.
 
-    Shapes and numbers of the laws begin at these unknowns; `shapes`, (m,), are the channel's.
+    Numbers of the laws begin at the unknown `laws`; `shapes`, (m,), are the channel's, `ends` its run's among all ends.
     """
+    index, m, d, moving = model.index, model.m, model.d, 2 * len(model.moving)
+    starts = laws + np.cumsum([0, *(law.form.size for law in p.laws)])
+    first = {law.mode: start for law, start in zip(p.laws, starts.tolist(), strict=False)}
     for law in p.laws:
-        size, shape = law.form.size, shapes[law.mode]
-        of_size = of_shapes + law.sensor * p.modes.omega.size + law.mode
-        yield np.array([of_size]), np.array([at]), np.array([shape / p.modes.phi[law.sensor, law.mode]])
-        yield of_laws + np.arange(size), at + 1 + np.arange(size), np.full(size, shape)
-        of_laws, at = of_laws + size, at + 1 + size
+        shape = shapes[law.mode]
+        for part in (law, law.moving(p.laws))[: 2 - (law.level_of is None)]:
+            k, unknowns = part.mode, list[int]()
+            if part is not law:
+                by_ends = -np.ones(2, int) if ends is None else model.kept + k * moving + np.r_[ends]
+                unknowns += [*by_ends, *range(index.gamma.start + k * d, index.gamma.start + (k + 1) * d)]
+                unknowns += [index.log_omega.start + k, index.log_ratios.start + k]
+            values = np.full(len(unknowns) + 1 + part.form.size, shape)
+            values[len(unknowns)] /= p.modes.phi[part.sensor, k] or 1.0
+            unknowns.append(index.phi.start + part.sensor * m + k)
+            unknowns += [first[k] + i if k in first else -1 for i in range(part.form.size)]
+            there = np.array(unknowns) >= 0
+            yield np.array(unknowns)[there], at + np.flatnonzero(there), values[there]
+            at += len(unknowns)
 
 
 def _clock_of(test: Measurement) -> tuple[float, tuple[int, ...], tuple[bool, ...]]:
@@ -169,13 +190,16 @@ def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray
         structure.damping_ratios,
     )  # fmt: skip
     ones = np.ones((test.n_runs, 2))
-    laws = tuple(ModeLaw(law.mode, law.sensor, law.form, law.values, ones) for law in structure.laws)
+    laws = tuple(
+        ModeLaw(law.mode, law.sensor, law.form, law.values, ones, level_of=law.level_of if law.followed else None)
+        for law in structure.laws
+    )
     motions = LawMotions(test)
     ends = np.zeros((structure.n, 2 * sum(not rest for rest in motions.at_rest)))
     p = Parameters(modes, structure.rigid_body_mass, ends, np.zeros(0), laws=laws)
     for run, lines in enumerate(test.own_lines):
-        for number, law in enumerate(laws):
-            added = motions.of_run(p, run, number)[0]
+        for law in laws:
+            added = motions.of_run(p, run, law)[0]
             response[run][:, lines] += modes.phi[:, [law.mode]] * added
             force[run][:, lines] += modes.gamma[law.mode][:, None] * added
     return response, force

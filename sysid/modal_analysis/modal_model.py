@@ -12,7 +12,7 @@ the modes, :math:`w^2 (W^2 - w^2 + i w \Phi' C \Phi)^{-1}` stands in the place o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -173,8 +173,9 @@ class Moves(NamedTuple):
 
 
 class ModeLaw(NamedTuple):
-    """A mode that follows its amplitude at a sensor, both by number, the form of its law and the law's numbers.
+    """A mode that follows the amplitude of one at a sensor, by number, the form of its law and the law's numbers.
 
+    The amplitude is its own, or that of the mode `level_of`.
     `equivalent`, (runs, 2), is by what frequency and damping ratio are multiplied for the linear mode that noise of the
     base moves in each run. `likelier` tells that the laws of a fit are likelier than none beyond chance.
     """
@@ -185,6 +186,23 @@ class ModeLaw(NamedTuple):
     values: Array
     equivalent: Array
     likelier: bool = False
+    level_of: int | None = None
+
+    @property
+    def followed(self) -> int:
+        """Number of the mode whose level counts."""
+        return self.mode if self.level_of is None else self.level_of
+
+    def moving(self, laws: Sequence[ModeLaw]) -> ModeLaw:
+        """How that mode moves: its law among these, or one that changes nothing."""
+        linear = self._replace(mode=self.followed, values=0 * self.values, level_of=None)
+        return next((law for law in laws if law.mode == self.followed), linear)
+
+    def among(self, numbers: list[int]) -> ModeLaw:
+        """The same where modes that had these numbers are all there are, itself and the one that it follows."""
+        return self._replace(
+            mode=numbers.index(self.mode), level_of=None if self.level_of is None else numbers.index(self.level_of)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +237,7 @@ class Parameters:
         """Those of some of the modes, by flags (m,) or numbers."""
         coupling = None if self.coupling is None else self.coupling[np.ix_(kept, kept)]
         numbers = np.arange(len(self.ends))[kept].tolist()
-        laws = tuple(law._replace(mode=numbers.index(law.mode)) for law in self.laws if law.mode in numbers)
+        laws = tuple(law.among(numbers) for law in self.laws if {law.mode, law.followed} <= {*numbers})
         return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling, laws=laws)
 
     def with_modes(self, modes: Modes, ends: Array) -> Parameters:

@@ -230,7 +230,7 @@ class RecordFit:
         ]  # fmt: skip
         sound &= [part.shape for part in parts] == shapes and all(np.all(np.isfinite(part)) for part in parts)
         sound &= coupling is None or (coupling.shape == (m, m) and bool(np.all(np.isfinite(coupling))))
-        sound &= all(law.mode in range(m) and law.sensor in range(model.n) for law in laws)
+        sound &= all({law.mode, law.followed} <= {*range(m)} and law.sensor in range(model.n) for law in laws)
         sound &= all(law.equivalent.shape == (test.n_runs, 2) and bool(np.all(law.equivalent > 0)) for law in laws)
         sound &= kept is None or (kept.shape == (m,) and kept.dtype == bool and bool(np.any(kept)))
         refuse((not sound, "the stored fit of the whole records is of another test, or holds what is no number"))

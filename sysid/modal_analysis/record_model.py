@@ -400,7 +400,7 @@ class LawChunk(Chunk):
         model, d = self.records, self.records.d
         at = 3 * model.m + model.m * d + d + len(self.trace_spectra) + (2 * d + model.channels) * model.gains
         at += 0 if self.at_ends is None else 2 * model.m
-        yield from law_entries(self.p, model.index.phi.start, model.of_laws.start, at, self.shapes[channel])
+        yield from law_entries(model, self.p, model.of_laws.start, at, self.shapes[channel], self.at_ends)
 
 
 class SummedChunk(Chunk):

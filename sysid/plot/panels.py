@@ -371,7 +371,7 @@ def draw_law(row: Sequence[Axes], law: FittedLaw, stretches: Sequence[Stretch]) 
     """Frequency and damping of a law into two axes, beside those of stretches, of all modes of its structure."""
     (low, high), k = law.levels, law.mode
     seen = [one for one in stretches if one.std[k] < one.ratio[k] * one.frequency[k]]  # others tell nothing
-    at = np.array([np.sqrt(2) * one.level[k] for one in seen])
+    at = np.array([np.sqrt(2) * one.level[law.level_of] for one in seen])
     of_stretches = np.array([
         ((one.frequency[k], one.std[k]), (100 * one.ratio[k], 100 * one.ratio_std[k])) for one in seen
     ]).reshape(-1, 2, 2)  # fmt: skip
@@ -389,7 +389,7 @@ def draw_law(row: Sequence[Axes], law: FittedLaw, stretches: Sequence[Stretch]) 
         ax.set_xscale("log")
         ax.set_xlim(levels[0], levels[-1])
         plain_log(ax.xaxis)
-        dress(ax, f"Mode {k + 1}", "", what)
+        dress(ax, f"Mode {k + 1}{f', by the level of mode {law.level_of + 1}' if law.followed else ''}", "", what)
 
 
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:

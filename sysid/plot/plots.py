@@ -416,7 +416,7 @@ def amplitude(identification: Identification) -> Figure:
         draw_law(row, law, stretches)
     legend_below(row[0], row[0].get_legend_handles_labels()[0], 2)
     for ax in row:
-        ax.set_xlabel("level of the mode [m/s²]")
+        ax.set_xlabel("level [m/s²]")
     return figure
 
 

@@ -251,6 +251,7 @@ class Identification(Answer):
             "amplitude_laws": [
                 {
                     "mode": law.mode + 1,
+                    "level_of_mode": law.level_of + 1,
                     "sensor": test.sensor_names[law.sensor],
                     **law.form._asdict(),
                     "values": law.values.tolist(),

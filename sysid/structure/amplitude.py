@@ -1,15 +1,16 @@
-"""Modes whose frequency and damping follow their own amplitude: the law, and its motion in time with sensitivities.
+"""Modes whose frequency and damping follow an amplitude: the law, and its motion in time with sensitivities.
 
 A mode of frequency w and damping ratio zeta moves by ``q'' + 2 zeta(A) w(A) q' + w(A)² q = -load``, with
 ``w(A) = w0 (1 - a (A/A0)^p)`` and ``zeta(A) = zeta0 + b (A/A0)^q``, A the envelope of its own acceleration,
-``w(A)² sqrt(q² + (q'/w(A))²)``, times the size of its shape at a sensor; A0 is a level at which a and b are read.
+``w(A)² sqrt(q² + (q'/w(A))²)``, times the size of its shape at a sensor, or that of another mode, as where joints that
+all modes move slip or harden by what the largest does; A0 is a level at which a and b are read.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -118,6 +119,10 @@ class FittedLaw:
         Whether the fit with the law is likelier than that without, beyond chance.
     mode : int
         Index of its mode among those of the structure that holds it.
+    followed : float
+        Hz at rest, of the mode whose level counts; zero where it is its own.
+    level_of : int
+        Index of that mode, as `mode`.
     """
 
     frequency: float
@@ -129,6 +134,8 @@ class FittedLaw:
     covariance: Array
     likelier: bool
     mode: int = 0
+    followed: float = 0.0
+    level_of: int = 0
 
     @property
     def is_certain(self) -> bool:
@@ -139,9 +146,12 @@ class FittedLaw:
         away = float(unit @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ unit)
         return self.likelier and away > beyond_chance(self.values.size)
 
-    def mode_among(self, frequencies: Array, within: float = 0.1) -> int | None:
-        """Number of the nearest of some modes, Hz, (m,); None where it is not `within` this share of the law's."""
-        apart = np.abs(frequencies / self.frequency - 1)
+    def mode_among(self, frequencies: Array, within: float = 0.1, *, followed: bool = False) -> int | None:
+        """Number of the nearest of some modes, Hz, (m,); None where it is not `within` this share of the law's.
+
+        With `followed` that of the mode whose level counts.
+        """
+        apart = np.abs(frequencies / ((followed and self.followed) or self.frequency) - 1)
         return min(np.flatnonzero(apart <= within).tolist(), key=apart.__getitem__, default=None)
 
     def at(self, level: float) -> tuple[float, float]:
@@ -217,31 +227,36 @@ def _step(z: ca.SX, first: ca.SX, last: ca.SX, h: ca.SX, w: ca.SX, zeta: ca.SX) 
 
 
 @functools.cache
-def _recursion(form: LawForm, steps: int, directions: int) -> ca.Function:
+def _recursion(form: LawForm, steps: int, directions: int, given: int) -> ca.Function:
     """The motion over all steps; with `directions` of the base, its derivatives too.
 
-    These are by the first state, by the participation in each direction, and by the numbers of the mode.
+    These are by the first state, by the participation in each direction, by the numbers of the mode, and by those that
+    a level depends upon which is given at each step's end: it and its derivatives are so many rows, none of an own one.
     """
     step = _functions(form)[1]
     state, load, h, p = (ca.SX.sym(*one) for one in (("z", 3), ("u", 2), ("h", 1), ("p", 3 + form.size)))
+    level = ca.SX.sym("A", given)
     after, restoring = step(state, load, h, p)
+    after = ca.vertcat(after[:2], level[:1]) if given else after
     if not directions:
-        return step.mapaccum("motion", steps)
-    count = 2 + directions + p.numel()
-    moves, motions = ca.SX.sym("S", 3, count), ca.SX.sym("U", 2, directions)
-    direct = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p))
+        return ca.Function("once", [state, load, level, h, p], [after, restoring]).mapaccum("motion", steps)
+    others = max(given - 1, 0)
+    moves, motions = ca.SX.sym("S", 3, 2 + directions + p.numel() + others), ca.SX.sym("U", 2, directions)
+    of_level = ca.vertcat(ca.SX.zeros(2, others), level[1:].T) if given else ca.SX.zeros(3, 0)
+    direct = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p), of_level)
     moved = ca.jacobian(after, state) @ moves + direct
     by = ca.jacobian(restoring, state) @ moves
-    by += ca.horzcat(ca.SX.zeros(1, 2 + directions), ca.jacobian(restoring, p))
+    by += ca.horzcat(ca.SX.zeros(1, 2 + directions), ca.jacobian(restoring, p), ca.SX.zeros(1, others))
     outputs = [ca.horzcat(after, moved), ca.horzcat(restoring, by)]
-    once = ca.Function("once", [ca.horzcat(state, moves), load, motions, h, p], outputs)
+    once = ca.Function("once", [ca.horzcat(state, moves), load, level, motions, h, p], outputs)
     return once.mapaccum("motion", steps)
 
 
 def motion(
-    form: LawForm, load: Array, step: float, numbers: Array, initial: Array, motions: Array | None = None
-) -> Array:
-    """Restoring acceleration of a mode at all samples of its load, and its derivatives.
+    form: LawForm, load: Array, step: float, numbers: Array, initial: Array, motions: Array | None = None,
+    level: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Restoring acceleration and level of a mode at all samples of its load, and their derivatives.
 
     Parameters
     ----------
@@ -255,41 +270,62 @@ def motion(
         Displacement and velocity at the first sample.
     motions : (d, n), optional
         Of the base, for derivatives by participations.
+    level : (1 or 1 + k, n), optional
+        Of another mode, m/s², which counts in place of its own; with `motions`, then its derivatives by k numbers.
 
     Returns
     -------
-    (n,) or, with `motions`, (3 + d + numbers.size, n)
-        ``-2 zeta w q' - w² q``; then its derivatives by the initial state, by participations, by the numbers.
+    two of (1, n) or, with `motions`, (3 + d + numbers.size + k, n)
+        ``-2 zeta w q' - w² q``, and the level, m/s²; then their derivatives by the initial state, by participations, by
+        the numbers, and by those of the given level.
     """
-    first = _functions(form)[0]
-    pairs = np.stack([load, np.append(load[1:], load[-1])])
-    if motions is None:
-        _, rows = _recursion(form, load.size, 0)(first(initial, numbers), pairs, step, numbers)
-        return np.asarray(rows).ravel()
-    d = len(motions)
-    state = np.zeros((3, 3 + d + numbers.size))
+    first, d = _functions(form)[0], 0 if motions is None else len(motions)
+    given = np.zeros((0, load.size)) if level is None else level
+    state = np.zeros((3, 1 if motions is None else 3 + d + numbers.size + max(len(given) - 1, 0)))
     state[:, :1] = first(initial, numbers)
-    by_initial, by_numbers = first.jacobian()(initial, numbers, state[:, :1])
-    state[:, 1:3], state[:, 3 + d :] = by_initial.full(), by_numbers.full()
-    both = np.stack([motions, np.hstack([motions[:, 1:], motions[:, -1:]])]).transpose(0, 2, 1)  # a pair of rows a step
-    _, rows = _recursion(form, load.size, d)(state, pairs, both.reshape(2, -1), step, numbers)
-    return np.asarray(rows.full()).reshape(load.size, -1).T
+    beside = []
+    if motions is not None:
+        by_initial, by_numbers = first.jacobian()(initial, numbers, state[:, :1])
+        state[:, 1:3], state[:, 3 + d : 3 + d + numbers.size] = by_initial.full(), by_numbers.full()
+        both = np.stack([motions, _next(motions)]).transpose(0, 2, 1)  # a pair of rows a step
+        beside = [both.reshape(2, -1)]
+    if level is not None:
+        state[2] = 0.0
+        state[2, [0, *range(state.shape[1] - len(given) + 1, state.shape[1])]] = given[:, 0]
+    moved = _recursion(form, load.size, d, len(given))
+    states, rows = moved(state, np.stack([load, _next(load)]), _next(given), *beside, step, numbers)
+    after = np.asarray(states[2, :].full()).reshape(load.size, -1)
+    return np.asarray(rows.full()).reshape(load.size, -1).T, np.vstack([state[2], after[:-1]]).T
 
 
-def modal_acceleration(
-    law: FittedLaw, mode: tuple[float, float, float], load: Array, rate: float, initial: Array,
+def _next(rows: Array) -> Array:
+    """The same a sample later, (..., n); the last stays."""
+    return np.concatenate([rows[..., 1:], rows[..., -1:]], axis=-1)
+
+
+def follow_laws(
+    modal: Array, laws: Sequence[FittedLaw], poles: Array, shapes: Array, loads: Array, rate: float, initial: Array,
     per_period: float = 96.0,
-) -> Array:  # fmt: skip
-    """Acceleration of a mode that follows a law, at the samples of its load, (n,).
+) -> None:  # fmt: skip
+    """Put accelerations of modes that follow laws in the place of those of linear ones, m/s², (m, n).
 
-    The load, m/s², is the spline through its samples by which linear modes move, straight over steps of `per_period`
-    in a period.
-    `mode` is of circular frequency, rad/s, damping ratio and shape at the law's sensor; `initial` as in `motion`.
+    Loads, m/s², (m, n), are the splines through their samples by which linear modes move, straight over steps of
+    `per_period` in a period. `poles` are circular frequencies, rad/s, and damping ratios, (2, m), `shapes` those at the
+    sensors, (s, m); `initial`, (2, m), as in `motion`.
     """
-    numbers = np.concatenate([np.log(np.abs(mode)), law.values])
-    times = max(int(np.ceil(per_period * mode[0] / (2 * np.pi) / rate)), 1)
-    fine = spline_of(load[None])(np.arange((load.size - 1) * times + 1) / times)[:, 0]
-    return motion(law.form, fine, 1 / (rate * times), numbers, initial)[::times] - load
+
+    def moved(law: FittedLaw, times: int, level: Array | None = None) -> tuple[Array, Array]:
+        k = law.mode
+        numbers = np.concatenate([np.log(np.abs([*poles[:, k], shapes[law.sensor, k]])), law.values])
+        fine = spline_of(loads[[k]])(np.arange((loads.shape[1] - 1) * times + 1) / times)[:, 0]
+        return motion(law.form, fine, 1 / (rate * times), numbers, initial[:, k], level=level)
+
+    with_law = {law.mode: law for law in laws}
+    for law in laws:
+        times = max(int(np.ceil(per_period * poles[0, law.mode] / (2 * np.pi) / rate)), 1)
+        first = with_law.get(law.level_of, replace(law, mode=law.level_of, values=0 * law.values))
+        level = None if first is law else moved(first, times)[1]
+        modal[law.mode] = moved(law, times, level)[0][0, ::times] - loads[law.mode]
 
 
 def laws_to_tree(laws: Sequence[FittedLaw]) -> list[dict[str, Any]] | None:

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, as_float, check_frequencies, refuse, shaped_array, symmetric_array, whole_number
-from sysid.structure.amplitude import FittedLaw, laws_from_tree, laws_to_tree, modal_acceleration
+from sysid.structure.amplitude import FittedLaw, follow_laws, laws_from_tree, laws_to_tree
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
 from sysid.structure.superelement import CraigBampton, ResidualModes, checked_rigid_motion, modal_gains, unturned
@@ -186,11 +186,12 @@ class Structure:
     def _set_laws(self, laws: Sequence[FittedLaw]) -> None:
         self.laws: tuple[FittedLaw, ...] = ()
         for law in laws:
-            mode = law.mode_among(self.natural_frequencies)
-            if mode is None:
-                what = f"the structure has no mode near {law.frequency:.4g} Hz, which the law is of"
+            mode, other = (law.mode_among(self.natural_frequencies, followed=one) for one in (False, True))
+            if mode is None or other is None:
+                frequency = law.frequency if mode is None else law.followed
+                what = f"the structure has no mode near {frequency:.4g} Hz, which the law is of"
                 raise InputError(f"laws: {what}: leave the law out (with_laws), or keep its mode")
-            self.laws += (replace(law, mode=mode),)
+            self.laws += (replace(law, mode=mode, level_of=other),)
         twice = len({law.mode for law in self.laws}) < len(self.laws)
         refuse((twice, "laws: two of them are of one mode, the nearest in frequency: keep one"))
 
@@ -403,10 +404,8 @@ class Structure:
         if initial is not None:
             state[:, : self.n] = np.linalg.solve(self._turned[1], shaped_array("initial", initial, 2, self.n).T).T
         modal = modal_accelerations(self._modal_model, motion, rate, state)
-        for law in self.laws:
-            k = law.mode
-            mode = self._omega[k], self.damping_ratios[k], self.mode_shapes[law.sensor, k]
-            modal[k] = modal_acceleration(law, mode, self.participation[k] @ motion, rate, state[:, k])
+        poles, n = np.stack([self._omega, self.damping_ratios]), self.n
+        follow_laws(modal, self.laws, poles, self.mode_shapes, self.participation @ motion, rate, state[:, :n])
         return motion, modal
 
     def to_state_space(self) -> StateSpace:

@@ -54,7 +54,7 @@ def test_the_motion_is_that_of_an_independent_integrator(form, fall, rise):
     for q, v in answer.y.T:
         w, zeta = of_level(form, fall, rise, q, v)
         expected.append(-2 * zeta * w * v - w**2 * q)
-    found = motion(form, dense, 1 / (RATE * fine), numbers(fall, rise), initial)[::fine]
+    found = motion(form, dense, 1 / (RATE * fine), numbers(fall, rise), initial)[0][0, ::fine]
     assert np.linalg.norm(found - expected) < 3e-4 * np.linalg.norm(expected)
 
 
@@ -62,11 +62,11 @@ def test_the_motion_is_that_of_an_independent_integrator(form, fall, rise):
 def test_derivatives_are_those_of_differences(form):
     u, values = np.stack([load(300), np.roll(load(300), 7)]), numbers(0.03, 0.002)
     gamma, initial = np.array([1.1, 0.4]), np.array([2e-3, 0.03])
-    exact = motion(form, gamma @ u, 1 / RATE, values, initial, u)
+    exact, _ = motion(form, gamma @ u, 1 / RATE, values, initial, u)
     x = np.concatenate([initial, gamma, values])
 
     def at(x):
-        return motion(form, x[2:4] @ u, 1 / RATE, x[4:], x[:2])
+        return motion(form, x[2:4] @ u, 1 / RATE, x[4:], x[:2])[0][0]
 
     assert np.allclose(exact[0], at(x), rtol=1e-12)
     for k in range(x.size):
@@ -79,7 +79,7 @@ def test_derivatives_are_those_of_differences(form):
 def test_a_mode_that_hardens_without_bound_moves_on_in_finite_numbers():
     """As a fit may try: each level raises the frequency, which raises the level."""
     u = np.stack([load(300), np.roll(load(300), 7)])
-    rows = motion(LawForm(2.0, 1.0, 1.0), np.array([1.1, 0.4]) @ u, 1 / RATE, numbers(-0.5, -0.01), np.zeros(2), u)
+    rows = motion(LawForm(2.0, 1.0, 1.0), np.array([1.1, 0.4]) @ u, 1 / RATE, numbers(-0.5, -0.01), np.zeros(2), u)[0]
     assert np.all(np.isfinite(rows))
 
 

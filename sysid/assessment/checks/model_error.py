@@ -265,11 +265,16 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
         numbers |= {"change of frequency": f, "its deviation": std, "change of damping": zeta}
-        over = f"over the levels tested ({low:.2g} to {high:.2g} m/s²)"
+        over, other = (
+            f"over the levels tested ({low:.2g} to {high:.2g} m/s²)",
+            law.mode_among(frequencies, followed=True),
+        )
+        numbers["level of mode"] = float(mode if other is None else other + 1)
+        whose = f"the amplitude of mode {other + 1}" if law.followed and other is not None else "its amplitude"
         if law.is_certain:
             yield Finding(
                 "amplitude law", Severity.NOTE,
-                f"mode {mode} follows its amplitude: from {low:.2g} to {high:.2g} m/s² its frequency changes by "
+                f"mode {mode} follows {whose}: from {low:.2g} to {high:.2g} m/s² its frequency changes by "
                 f"{100 * f:.2g} % (+- {100 * LIKELY * std:.2g} %) and its damping ratio by {100 * zeta:.2g} % of "
                 f"critical (+- {100 * LIKELY * of_damping:.2g})", numbers=numbers,
             )  # fmt: skip
