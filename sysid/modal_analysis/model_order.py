@@ -464,7 +464,7 @@ def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, f
     while True:
         fit = pruned(fit, monitor)
         modes, value, least = fit.parameters.modes, worth(fit), least_worth(fit.model)
-        value[np.arange(value.size) >= value.size - fit.static] = np.inf
+        value[_of_others(fit)] = np.inf
         apart = np.abs(np.log(modes.omega / modes.omega[:, None])) / (2 * modes.ratios)
         value[np.sort(apart, axis=0)[1:2].min(axis=0, initial=np.inf) > near] = np.inf
         if np.min(value) >= few * least:
@@ -475,11 +475,17 @@ def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, f
         fit = fewer
 
 
+def _of_others(fit: RecordFit) -> NDArray[np.bool_]:
+    """True for static modes, and beside them for all above the lines: they stand for others, and need not show."""
+    return (fit.static > 0) & (fit.parameters.modes.omega > 2 * np.pi * fit.test.freq[-1])
+
+
 def _least(fit: RecordFit) -> NDArray[np.bool_]:
     """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
-    value = np.where(no_modes(fit), 0.0, [rise(one) for one in np.eye(m, dtype=bool)])
-    value[m - fit.static :] = np.inf
+    value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
+    value[_of_others(fit)] = np.inf
+    value[no_modes(fit)] = 0.0
     first, *others = np.argsort(value, kind="stable")
     gone = (np.arange(m) == first) & (value < least) & (m - fit.static > 1)
     for k in others[:-1]:
