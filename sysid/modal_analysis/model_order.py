@@ -464,7 +464,6 @@ def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, f
     while True:
         fit = pruned(fit, monitor)
         modes, value, least = fit.parameters.modes, worth(fit), least_worth(fit.model)
-        value[np.arange(value.size) >= value.size - fit.static] = np.inf
         apart = np.abs(np.log(modes.omega / modes.omega[:, None])) / (2 * modes.ratios)
         value[np.sort(apart, axis=0)[1:2].min(axis=0, initial=np.inf) > near] = np.inf
         if np.min(value) >= few * least:
