@@ -105,11 +105,8 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible, whose, figure = (
-        max(float(np.sqrt(free.squared_error / records.size)), EXACT),
-        "its poles",
-        "free residues",
-    )
+    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
+    whose, figure = "its poles", "free residues"
     wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
     if misfit <= MISFIT * possible:
         poles = None if formulation.free_modes else PolesAndResidues.of(test)
