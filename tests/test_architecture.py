@@ -78,11 +78,11 @@ CEILINGS = {
     # less what stood twice, of outputs, misfits, structures of modes and callbacks (200);
     # and modes that others close by or drift make look worth something, channels of noise alone, poles beside coupled
     # damping, headers as more programs write them (7, beside what was taken away).
-    "lines": 49_386,
+    "lines": 49_360,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables.
     "files": 193,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 77.8,  # modes left out .2, laws one by one .2, of another level .3, delays .1, gains .2, a reading .2
+    "branches": 77.77,  # modes left out .2, laws one by one .2, of another level .3, delays .1, gains .2, a reading .2
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

@@ -199,11 +199,9 @@ def recorded_rate(recording: Recording, said: Description) -> float:
     column = next(iter(_time_columns(recording, said)), None)
     if column is None:
         rate = said.sample_rate or recording.sample_rate
-        words = (
-            f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in Hz'
-        )
+        words = f'{recording.path} has no column of time that is named so: state time = "ITS NAME" or sample_rate, in'
         if rate is None or not 0 < rate < np.inf:
-            raise InputError(f"{words} (--time, --rate); {recording.in_words()}")
+            raise InputError(f"{words} Hz (--time, --rate); {recording.in_words()}")
         return rate
     place, known = f"{recording.path}, {column.place}", units.find(column.unit or "s")
     if known is None or known.quantity != "time":

@@ -99,15 +99,14 @@ def _stages(
             break
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
-        noisy = best
         if left_of(best) < much:
             monitor.doing = "noise of all channels"
             noisy = _with_noise(best, _with_equivalents(best), ROUGH, monitor)
-        if noisy is not best and left_of(noisy) < 1.1 * left_of(best):  # else noise of the base takes what laws miss
-            best = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
-            linear = _with_noise(best, linear.parameters, TRIAL, monitor)
-            if not fit.model.whole.plain:  # what it explains by noise of the base may have taken many steps
-                linear = max(linear, fit, key=lambda one: one.likelihood)
+            if left_of(noisy) < 1.1 * left_of(best):  # else noise of the base takes what laws miss
+                best = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
+                linear = _with_noise(best, linear.parameters, TRIAL, monitor)
+                if not fit.model.whole.plain:  # what it explains by noise of the base may have taken many steps
+                    linear = max(linear, fit, key=lambda one: one.likelihood)
     if plain or len(best.parameters.laws) > 1:
         best, gone = _holding(best, linear, limits if best.model.whole.plain else WHOLE, monitor)
         left_out += gone
@@ -131,9 +130,8 @@ def _with_law_of(
     first = before if exponents == "auto" else exponents
     started: list[RecordFit] = []
     for begun in _beginnings(best, omega, monitor):
-        if best.parameters.laws:
-            started.append(_started(*begun, first, (), limits, monitor))
-        started.append(_started(*begun, first, tries, limits, monitor))
+        for falls in ((), tries)[not best.parameters.laws :]:  # without falls as the first law, where there is one
+            started.append(_started(*begun, first, falls, limits, monitor))
         if max(one.schwarz for one in started) > best.schwarz:
             break
     best = max(started, key=lambda one: one.schwarz)
@@ -268,17 +266,14 @@ def _started(
     """
     p, found, followed = fit.parameters, [], np.arange(fit.model.m) == mode
     ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
-    law = ModeLaw(
-        mode,
-        int(np.argmax(np.abs(p.modes.phi[:, mode]))),
-        LawForm(*exponents, 1.0),
-        np.zeros(2),
-        np.ones((fit.test.n_runs, 2)),
-    )
-    law = law._replace(form=law.form._replace(level=_levels(fit, law)[1]))
-    if not tries:
+    ones = np.ones((fit.test.n_runs, 2))
+    if tries:
+        sensor = int(np.argmax(np.abs(p.modes.phi[:, mode])))
+        form = LawForm(*exponents, float(np.concatenate(_envelopes(fit, mode, sensor)).max()))
+        law = ModeLaw(mode, sensor, form, np.zeros(2), ones)
+    else:
         first = p.laws[0]
-        law = law._replace(sensor=first.sensor, form=first.form, values=first.values, level_of=first.followed)
+        law = ModeLaw(mode, first.sensor, first.form, first.values, ones, level_of=first.followed)
     for values in [np.array([fall, 0.0]) for fall in tries] or [law.values]:
         law = law._replace(values=values)
         modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + values[0] / 2, 1.0))
@@ -338,12 +333,6 @@ def _with_equivalents(fit: RecordFit) -> Parameters:
     return replace(p, laws=tuple(laws))
 
 
-def _levels(fit: RecordFit, law: ModeLaw, share: float = 0.05) -> tuple[float, float]:
-    """Level that the mode of a law's level exceeds but for a `share` of the time, and its highest, m/s²."""
-    level = np.concatenate(_envelopes(fit, law.followed, law.sensor))
-    return float(np.quantile(level, share)), float(level.max())
-
-
 def _envelopes(fit: RecordFit, mode: int, sensor: int) -> list[Array]:
     """Level of a mode at a sensor at all samples of each run, m/s²."""
     whole = fit.model.whole
@@ -370,10 +359,8 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         at = [*(start + law.mode for start in poles), *range(first, first + law.form.size)]
         first += law.form.size
         pole = float(p.modes.omega[law.mode] / (2 * np.pi)), float(p.modes.ratios[law.mode])
-        cov, other = covariance[np.ix_(at, at)], 0.0
-        if law.level_of is not None:
-            other = float(p.modes.omega[law.level_of] / (2 * np.pi))
-        found.append(
-            FittedLaw(*pole, law.sensor, law.form, law.values, _levels(fit, law), cov, law.likelier, followed=other)
-        )
+        other = 0.0 if law.level_of is None else float(p.modes.omega[law.level_of] / (2 * np.pi))
+        level, cov = np.concatenate(_envelopes(fit, law.followed, law.sensor)), covariance[np.ix_(at, at)]
+        levels = float(np.quantile(level, 0.05)), float(level.max())
+        found.append(FittedLaw(*pole, law.sensor, law.form, law.values, levels, cov, law.likelier, followed=other))
     return tuple(found)

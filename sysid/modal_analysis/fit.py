@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from sysid.errors import InputError, Stop
 from sysid.measurement.clocks import without_delays
+from sysid.measurement.gains import tolerance_of, without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
@@ -41,7 +41,6 @@ from sysid.modal_analysis.record_fit import (
     without,
 )
 from sysid.modal_analysis.residual_tests import (
-    beside_free_gains,
     calibration_of,
     delays_left,
     delays_of,
@@ -67,6 +66,7 @@ from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
 from sysid.structure.amplitude import AmplitudeLaw
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import most_deviations
 
 
 def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMonitor | None = None) -> RecordFit:
@@ -82,10 +82,10 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
     Stop, KeyboardInterrupt
         Where the monitor stops it before there was a fit.
     """
-    of_noise = _whole_fit if delays is None else functools.partial(_on_one_clock, delays=delays)
 
     def fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
-        return beside_free_gains(_no_worse_than_squares(of_noise(test, monitor=monitor), monitor), _whole_fit, monitor)
+        found = _whole_fit(test, monitor) if delays is None else _on_one_clock(test, delays=delays, monitor=monitor)
+        return _beside_free_gains(_no_worse_than_squares(found, monitor), monitor)
 
     if monitor is None:
         return fit(test, monitor=FitMonitor())
@@ -125,6 +125,36 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
     return squares if left > worse * left_of(squares) and not runs_in_motion(fit) else fit
+
+
+def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -> RecordFit:
+    """The fit of modes that are found beside free gains of all sensors, where it is likelier; else as it is.
+
+    A wrong gain is one number, for which poles beyond the lines, static modes and dampers stand as far as they can.
+    What the gains add is taken off; shapes stay as recorded. A mode below the lines makes constants of its own: it
+    gives way to one gain, of a sensor or of the base, or stays, and then gains are not judged.
+    """
+    test, n = fit.test, fit.model.n
+    below = np.any(fit.parameters.modes.omega < 2 * np.pi * test.freq[0])
+    stays = fit.stopped or fit.model.whole.plain or np.any(tolerance_of(test))
+    try:
+        if stays or not (below or np.any(gain_errors_of(fit).certain)):
+            return fit
+        given = replace(test, gain_std=np.full(n, std), whole=replace(fit.model.whole, varying=None))
+        gain = gain_errors_of(replace(free := _whole_fit(given, monitor), constants=std * free.parameters.gains))
+        count, apart = np.count_nonzero(gain.certain), gain.error - gain.error[np.argmax(np.abs(gain.certain))]
+        several = count == 2 or np.any((gain.certain != 0) & (np.abs(apart) > most_deviations(n) * gain.std))
+        if (below and several) or np.max(np.abs(gain.certain)) > 3 * std:  # an axis or a sign makes larger errors
+            return fit
+        right = without_constants(replace(free.test, gain_std=test.gain_std), gain.certain)
+        more = refitted(replace(free, test=right), replace(free.parameters, gains=np.zeros(0)), monitor=monitor)
+        likelier = more.settled and more.schwarz - count * np.log(more.model.numbers) / 2 > fit.schwarz
+        likelier &= not np.any(more.parameters.modes.omega < 2 * np.pi * test.freq[0])
+    except (Stop, KeyboardInterrupt):
+        return replace(fit, stopped=True)
+    except (InputError, np.linalg.LinAlgError):  # the fit at hand is one of gains as they are stated
+        return fit
+    return replace(more, constants=gain.certain) if likelier else fit
 
 
 def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
@@ -364,9 +394,7 @@ def _of_lines(
         return plain
 
 
-def _calibrated(
-    fit: RecordFit, stated: Calibration, monitor: FitMonitor | None
-) -> tuple[RecordFit, Calibration]:  # fmt: skip
+def _calibrated(fit: RecordFit, stated: Calibration, monitor: FitMonitor | None) -> tuple[RecordFit, Calibration]:
     """The fit once more without the errors of gains that it makes likely within tolerances.
 
     And without modes that stood for them, whose share of the errors is found once they are gone.

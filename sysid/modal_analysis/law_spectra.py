@@ -54,9 +54,9 @@ class LawMotions:
             self._series[run, times] = np.fft.irfft(spectrum, fine)
         return times, self._series[run, times]
 
-    def added(self, p: Parameters, run: Run, law: int) -> ComplexArray:
+    def added(self, p: Parameters, run: Run, law: ModeLaw) -> ComplexArray:
         """What a law adds at the lines of a part of a run."""
-        return self.of_run(p, run.number, p.laws[law])[:, run.among(self.lines[run.number])]
+        return self.of_run(p, run.number, law)[:, run.among(self.lines[run.number])]
 
     def of_run(self, p: Parameters, run: int, law: ModeLaw) -> ComplexArray:
         """What a law adds at all lines of a run."""

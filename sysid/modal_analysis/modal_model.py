@@ -198,12 +198,6 @@ class ModeLaw(NamedTuple):
         linear = self._replace(mode=self.followed, values=0 * self.values, level_of=None)
         return next((law for law in laws if law.mode == self.followed), linear)
 
-    def among(self, numbers: list[int]) -> ModeLaw:
-        """The same where modes that had these numbers are all there are, itself and the one that it follows."""
-        return self._replace(
-            mode=numbers.index(self.mode), level_of=None if self.level_of is None else numbers.index(self.level_of)
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
@@ -236,8 +230,9 @@ class Parameters:
     def at(self, kept: NDArray[Any]) -> Parameters:
         """Those of some of the modes, by flags (m,) or numbers."""
         coupling = None if self.coupling is None else self.coupling[np.ix_(kept, kept)]
-        numbers = np.arange(len(self.ends))[kept].tolist()
-        laws = tuple(law.among(numbers) for law in self.laws if {law.mode, law.followed} <= {*numbers})
+        number: dict[int | None, int] = {was: at for at, was in enumerate(np.arange(len(self.ends))[kept].tolist())}
+        whole = [law for law in self.laws if {law.mode, law.followed} <= number.keys()]
+        laws = tuple(law._replace(mode=number[law.mode], level_of=number.get(law.level_of)) for law in whole)
         return replace(self, modes=self.modes.at(kept), ends=self.ends[kept], coupling=coupling, laws=laws)
 
     def with_modes(self, modes: Modes, ends: Array) -> Parameters:

@@ -380,7 +380,7 @@ class LawChunk(Chunk):
     def added(self) -> list[ComplexArray]:
         """What each law adds."""
         motions = self.records.law_motions
-        return [] if motions is None else [motions.added(self.p, self.run, law) for law in range(len(self.p.laws))]
+        return [] if motions is None else [motions.added(self.p, self.run, law) for law in self.p.laws]
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
         """See `Lines`."""

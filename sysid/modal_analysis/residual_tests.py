@@ -15,16 +15,14 @@ jackknife, which is too wide: a block may hold most of what tells a mode.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.errors import Stop
-from sysid.measurement.gains import tolerance_of, without_constants
-from sysid.measurement.measurement import Measurement
+from sysid.measurement.gains import without_constants
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -342,36 +340,6 @@ def _with_gains(fit: RecordFit, asked: NDArray[np.intp], step: Array) -> RecordF
     p = fit.model.unpack(fit.model.moved(fit.model.pack(fit.parameters), x))
     trial = replace(fit, test=without_constants(fit.test, errors), parameters=p)
     return replace(trial, chi2=trial.model.gradient(p, fit.levels).chi2)
-
-
-def beside_free_gains(
-    fit: RecordFit, anew: Callable[[Measurement, FitMonitor], RecordFit], monitor: FitMonitor, std: float = 0.05
-) -> RecordFit:
-    """The fit of modes that are found beside free gains of all sensors, where it is likelier; else as it is.
-
-    A wrong gain is one number, for which poles beyond the lines, static modes and dampers stand as far as they can. So
-    modes are looked for `anew` where gains show beyond chance at the end of a fit, or where a mode below the lines
-    hides them. What these gains add is taken off; shapes stay as recorded. A mode below the lines makes constants of
-    its own: it stays, unless one gain, of a sensor or of the base, explains as much.
-    """
-    test, n = fit.test, fit.model.n
-    below = np.any(fit.parameters.modes.omega < 2 * np.pi * test.freq[0])
-    stays = fit.stopped or fit.model.whole.plain or np.any(tolerance_of(test))
-    if stays or not (below or np.any(gain_errors_of(fit).certain)):
-        return fit
-    try:
-        free = anew(replace(test, gain_std=np.full(n, std), whole=replace(fit.model.whole, varying=None)), monitor)
-        gain = gain_errors_of(replace(free, constants=std * free.parameters.gains))
-        count, apart = np.count_nonzero(gain.certain), gain.error - gain.error[np.argmax(np.abs(gain.certain))]
-        several = count == 2 or np.any((gain.certain != 0) & (np.abs(apart) > most_deviations(n) * gain.std))
-        if (below and several) or np.max(np.abs(gain.certain)) > 3 * std:  # an axis or a sign makes larger errors
-            return fit
-        right = without_constants(replace(free.test, gain_std=test.gain_std), gain.certain)
-        more = refitted(replace(free, test=right), replace(free.parameters, gains=np.zeros(0)), monitor=monitor)
-    except (Stop, KeyboardInterrupt):
-        return replace(fit, stopped=True)
-    likelier = more.settled and more.schwarz - count * np.log(more.model.numbers) / 2 > fit.schwarz
-    return replace(more, constants=gain.certain) if likelier else fit
 
 
 def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:

@@ -322,7 +322,7 @@ def follow_laws(
 
     with_law = {law.mode: law for law in laws}
     for law in laws:
-        times = max(int(np.ceil(per_period * poles[0, law.mode] / (2 * np.pi) / rate)), 1)
+        times = max(int(np.ceil(per_period * max(poles[0, [law.mode, law.level_of]]) / (2 * np.pi) / rate)), 1)
         first = with_law.get(law.level_of, replace(law, mode=law.level_of, values=0 * law.values))
         level = None if first is law else moved(first, times)[1]
         modal[law.mode] = moved(law, times, level)[0][0, ::times] - loads[law.mode]

@@ -10,11 +10,13 @@ import sysid
 from sysid import Problem, Sensor, Structure, simulate
 from sysid.assessment.checks.gains import GainErrors
 from sysid.assessment.uncertainty import moves_by_records
+from sysid.errors import InputError
 from sysid.jobs.changes import drawn_from
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
-from sysid.modal_analysis.fit import fit_modes, whole_fit
+from sysid.modal_analysis.fit import _beside_free_gains, fit_modes, whole_fit
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.model_order import Peak, with_peak
 from sysid.modal_analysis.record_fit import on_turned
 from sysid.modal_analysis.record_model import RecordModel
@@ -294,6 +296,26 @@ def test_poles_that_stand_for_a_wrong_gain_are_not_in_the_answer(records, plain,
 
 
 def test_right_gains_and_modes_below_the_lines_take_no_constants_off(records):
+    """Beside a mode below the lines gains are not judged, and what was taken off would not be told."""
     f = np.sort(frame().natural_frequencies)
-    for test in (records, records.at(records.freq > (f[0] + f[1]) / 2)):
-        assert not np.any(whole_fit(test).constants)
+    above = records.at(records.freq > (f[0] + f[1]) / 2)
+    for test in (records, above, misread(above, ERROR * np.eye(6)[2])):
+        fit = whole_fit(test)
+        assert not (np.any(fit.constants) and np.any(fit.parameters.modes.omega < 2 * np.pi * test.freq[0]))
+    assert not np.any(whole_fit(above).constants)
+
+
+def test_what_ends_the_search_beside_free_gains_keeps_the_fit_at_hand(records, monkeypatch):
+    fit = whole_fit(misread(records, ERROR * np.eye(6)[0]))
+    wrong = dataclasses.replace(fit, test=misread(records, ERROR * np.eye(6)[0]), constants=np.zeros(1))
+
+    def ended(error):
+        def anew(*_):
+            raise error
+
+        monkeypatch.setattr("sysid.modal_analysis.fit._whole_fit", anew)
+        return _beside_free_gains(wrong, FitMonitor())
+
+    assert np.any(fit.constants) and ended(InputError("no mode stands out")) is wrong
+    stopped = ended(KeyboardInterrupt())
+    assert stopped.stopped and stopped.test is wrong.test and stopped.parameters is wrong.parameters

@@ -67,11 +67,12 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (1 + velocity):
         return leaks
     free = records.fit(*poles, velocity=velocity)
-    errors = None if changing else gain_errors(modal, structure)  # which a change of frequencies would explain
+    taken = modal.record_fit is not None and np.any(modal.record_fit.constants)  # what was taken off has to be told
+    errors = gain_errors(modal, structure) if taken or not changing else None  # which changes would explain
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
     if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
-    gains = [] if rigid or errors is None else list(wrong_gains(test, errors, structure))
+    gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
     found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):
@@ -105,11 +106,8 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible, whose, figure = (
-        max(float(np.sqrt(free.squared_error / records.size)), EXACT),
-        "its poles",
-        "free residues",
-    )
+    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
+    whose, figure = "its poles", "free residues"
     wrong = "the model, a sign or axis in rigid_body, or a record is not what it is said to be"
     if misfit <= MISFIT * possible:
         poles = None if formulation.free_modes else PolesAndResidues.of(test)

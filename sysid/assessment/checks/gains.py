@@ -258,7 +258,7 @@ def wrong_gains(test: Measurement, errors: GainErrors, structure: Structure) -> 
         if base is not None:
             explained |= driven
             yield _of_base(name, base, errors, driven)
-    judged = np.any(np.isfinite(errors.error)) and not np.any(errors.tolerance)
+    judged = test.n_base > 1 and np.any(np.isfinite(errors.error)) and not np.any(errors.tolerance)
     of_axes = list(_of_axes(test, structure)) if judged and not np.any(explained) else []
     explained |= bool(of_axes)
     yield from of_axes
@@ -276,7 +276,7 @@ def wrong_gains(test: Measurement, errors: GainErrors, structure: Structure) -> 
 
 def _of_axes(test: Measurement, structure: Structure) -> Iterator[Finding]:
     """Gains of single base directions of several, by what all sensors move by along each beside their modes."""
-    for axis, name in enumerate(test.base_axes if test.n_base > 1 else ()):
+    for axis, name in enumerate(test.base_axes):
         along = np.where(np.arange(test.n_base) == axis, test.rigid_body, 0.0)
         found = errors_along(test, distinct_poles(structure), along, velocity=not structure.modal_damping)
         errors = found and GainErrors(*found, np.zeros(test.n_sensors))

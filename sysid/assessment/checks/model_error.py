@@ -265,10 +265,8 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
         numbers = {"mode": float(mode), "lowest": low, "highest": high}
         (f, zeta), (std, of_damping) = law.change()
         numbers |= {"change of frequency": f, "its deviation": std, "change of damping": zeta}
-        over, other = (
-            f"over the levels tested ({low:.2g} to {high:.2g} m/s²)",
-            law.mode_among(frequencies, followed=True),
-        )
+        over = f"over the levels tested ({low:.2g} to {high:.2g} m/s²)"
+        other = law.mode_among(frequencies, followed=True)
         numbers["level of mode"] = float(mode if other is None else other + 1)
         whose = f"the amplitude of mode {other + 1}" if law.followed and other is not None else "its amplitude"
         if law.is_certain:
