@@ -182,7 +182,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
     """
     delays, first = _first_delays(test, delays, monitor)
-    fit = _whole_fit(without_delays(test, delays), monitor, first)
+    fit = found = _whole_fit(without_delays(test, delays), monitor, first)
     try:
         for _ in range(rounds):
             # What shares of the signal hold of a delay hides it: then it shows by what the fit gains without it.
@@ -202,7 +202,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
             fit = on_turned(fit, without_delays(test, np.where(certain, delays, 0.0)), monitor=monitor)
-        return without_weak_modes(fit, monitor)
+        return fit if fit is found else without_weak_modes(fit, monitor)  # which was done there
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
 
