@@ -130,10 +130,13 @@ def check_column(column: Column, path: Path) -> None:
 def rate_of(time: Array, path: Path, place: str) -> float:
     """Sample rate of a time column in s, Hz; numbers rounded to a quarter of a step are even.
 
-    A time of day may pass midnight. Refused is time that does not rise, or whose steps are uneven, with its sample.
+    A time of day may pass midnight; day numbers of a spreadsheet are days. Refused is time that does not rise, or whose
+    steps are uneven, with its sample.
     """
     refuse((time.size < 3, f"{path}: {time.size} samples are no record: is it the right file, and whole?"))
     day = 86400.0
+    if time[0] > 1e4 and abs(time[-1] - time[0]) < 1e-5 * time.size:  # days, as spreadsheets count them
+        time = time * day
     time = time + day * np.cumsum(np.diff(time, prepend=time[0]) < -0.99 * day)
     falls = np.flatnonzero(np.diff(time) <= 0)
     if falls.size:

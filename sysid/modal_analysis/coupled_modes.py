@@ -41,10 +41,14 @@ from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 
-def score_of_couplings(model: RecordModel, equations: NormalEquations) -> tuple[float, int]:
-    """Fall of twice the sum of squares that couplings promise in one step, and how many show."""
+def score_of_couplings(model: RecordModel, equations: NormalEquations, p: Parameters) -> tuple[float, int]:
+    """Fall of twice the sum of squares that couplings promise in one step, and how many show.
+
+    Beside those of modes above the lines with each other, which mimic what is missing of these.
+    """
+    inside = p.modes.omega <= 2 * np.pi * model.test.freq[-1]
     own = np.zeros(model.size, bool)
-    own[model.coupling] = True
+    own[model.coupling] = np.any(inside[model.coupled], axis=1)
     return score(equations, own)
 
 
@@ -86,18 +90,21 @@ def with_couplings(
     p, m = fit.parameters, fit.model.m
     if p.coupling is not None or m - fit.static < 2:
         return fit
-    # Beside what a wrong gain or modes above the lines make, which couplings would mimic.
-    model = RecordModel(fit.test, m, gains=True, static=fit.static, coupled=True).at_signal(p)
-    beyond, equations = max(fit.reduced, 1.0), model.normal_equations(p, fit.levels)
-    promised, count = score_of_couplings(model, equations)
+    model, equations, (promised, count) = _asked(fit)
+    beyond = max(fit.reduced, 1.0)
     above = (np.arange(model.size) >= model.n_fit + model.n * model.d) & (np.arange(model.size) < model.delays)
     if promised < beyond * beyond_chance(count):
         return fit
-    monitor.doing = f"{m} modes and the dampers between them"
     # What modes above the lines leave would pass for couplings of those that stand for them.
     hidden = promised < score(equations, above)[0]
     if hidden and (fit.static or not model.force):
         return fit
+    plain = with_static_modes(fit, monitor=monitor) if hidden else fit
+    if plain is not fit:
+        promised, count = _asked(plain)[2]
+        if promised < max(plain.reduced, 1.0) * beyond_chance(count):
+            return plain
+    monitor.doing = f"{m} modes and the dampers between them"
     more = fit if hidden else _coupled(fit, p, fit.static, pruned, some, monitor)
     above_them = not fit.static and model.force and (hidden or misses_modes_above(more))
     if above_them:  # which dampers couple with those in the lines
@@ -112,11 +119,22 @@ def with_couplings(
     if single or not (
         more.settled and passive(more.parameters, 2 * np.pi * fit.test.freq[-1]) and gained > beyond * least
     ):
-        return with_static_modes(fit, monitor=monitor) if above_them else fit
+        return with_static_modes(fit, monitor=monitor) if above_them and not hidden else plain
     alone = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     if alone is None:
         return in_gauge(more) if model.force else fit  # which weighs the modes, so that couplings are symmetric
     return replace(more, parameters=alone)
+
+
+def _asked(fit: RecordFit) -> tuple[RecordModel, NormalEquations, tuple[float, int]]:
+    """The model with couplings, its equations at a fit without them, and their score.
+
+    Beside what a wrong gain or modes above the lines make, which couplings would mimic.
+    """
+    p = fit.parameters
+    model = RecordModel(fit.test, fit.model.m, gains=True, static=fit.static, coupled=True).at_signal(p)
+    equations = model.normal_equations(p, fit.levels)
+    return model, equations, score_of_couplings(model, equations, p)
 
 
 def _coupled(

@@ -122,7 +122,7 @@ def with_couplings_of_lines(modal: ModalEstimate, monitor: IterationMonitor, max
     here = asked.normal_equations(first, model.levels)
     numbers = 2 * (test.response.size + test.base.size)
     freedom, count = numbers - model.unknowns, len(model.coupled)
-    promised, seen = score_of_couplings(asked, here)
+    promised, seen = score_of_couplings(asked, here, first)
     least = 2 * here.chi2 / max(freedom, EXACT) * beyond_chance(seen)  # far more than there is without any freedom
     # The factor is one or more, and takes a fit: it is asked for last.
     if promised < least or promised < (shared := _shared_by_lines(test, fit.modes)) * least:

@@ -21,7 +21,6 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
 from sysid.modal_analysis.misfit import deviations, left_of, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import (
     least_worth,
     peaks_of,
@@ -59,6 +58,7 @@ from sysid.modal_analysis.rough_poles import (
     at_sines_alone,
     decimated_lines,
     rough_deviations,
+    same_modes,
     steady_sine,
 )
 from sysid.modal_analysis.spectra_modes import strongest_poles
@@ -144,11 +144,15 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
         gain = gain_errors_of(replace(free := _whole_fit(given, monitor), constants=std * free.parameters.gains))
         count, apart = np.count_nonzero(gain.certain), gain.error - gain.error[np.argmax(np.abs(gain.certain))]
         several = count == 2 or np.any((gain.certain != 0) & (np.abs(apart) > most_deviations(n) * gain.std))
-        if (below and several) or np.max(np.abs(gain.certain)) > 3 * std:  # an axis or a sign makes larger errors
+        worth = free.schwarz - (price := count * np.log(fit.model.numbers) / 2)
+        # An axis or a sign makes larger errors; and what free gains do not make likelier, these alone do not either.
+        if (below and several) or np.max(np.abs(gain.certain)) > 3 * std or worth <= fit.schwarz:
             return fit
         right = without_constants(replace(free.test, gain_std=test.gain_std), gain.certain)
-        more = refitted(replace(free, test=right), replace(free.parameters, gains=np.zeros(0)), monitor=monitor)
-        likelier = more.settled and more.schwarz - count * np.log(more.model.numbers) / 2 > fit.schwarz
+        lines = decimated_lines(test)
+        some, p = None if np.all(lines) else right.at(lines), replace(free.parameters, gains=np.zeros(0))
+        more = refitted(replace(free, test=right), p, some=some, monitor=monitor)
+        likelier = more.settled and more.schwarz - price > fit.schwarz
         likelier &= not np.any(more.parameters.modes.omega < 2 * np.pi * test.freq[0])
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
@@ -201,7 +205,9 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 break
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
-            fit = on_turned(fit, without_delays(test, np.where(certain, delays, 0.0)), monitor=monitor)
+            kept = np.where(certain, delays, 0.0)
+            fewer = on_turned(fit, without_delays(test, kept), monitor=monitor)
+            fit = fewer if fewer.schwarz + _price(delays, kept, fit) > fit.schwarz else fit
         return fit if fit is found else without_weak_modes(fit, monitor)  # which was done there
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
@@ -267,7 +273,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
     fit = _fitted(_rough_fit(test, monitor), monitor) if first is None else first
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
-    if not _same_modes(fit.parameters.modes, again):
+    if not same_modes(fit.parameters.modes, again):
         fit = max(fit, _fitted(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
     return _with_all_modes(fit, monitor)
 
@@ -305,19 +311,11 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
     """
     if beside is not None and beside.settled and beside.model.m == fit.model.m and beside.schwarz >= fit.schwarz:
         last = 2 * np.pi * fit.test.freq[-1]
-        if _same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
+        if same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
             return beside
     fit = pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
     return fit
-
-
-def _same_modes(modes: Modes, poles: Poles | Modes) -> bool:
-    """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
-    if modes.omega.size != poles.omega.size:
-        return False
-    apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
-    return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
 
 
 def fit_modes(

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -121,3 +122,11 @@ def poles_of_test(test: Measurement) -> tuple[Array, Array]:
         test = replace(test, response_std=rough_deviations(test))
     found = find_poles(test)
     return found.omega, found.ratios
+
+
+def same_modes(modes: Modes, poles: Poles | Modes) -> bool:
+    """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
+    if modes.omega.size != poles.omega.size:
+        return False
+    apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
+    return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))

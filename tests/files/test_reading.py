@@ -88,6 +88,14 @@ def test_times_of_day_have_dates_beside_them_halves_of_a_day_and_pass_midnight(t
     assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(200, rel=1e-9)
 
 
+@pytest.mark.parametrize("begins", [46082.5, 740042.5])
+def test_day_numbers_of_a_spreadsheet_are_days(tmp_path, begins):
+    """Two seconds at 200 Hz from noon of 1 March 2026, as Excel and as MATLAB count days; rounded to .1 ms."""
+    rows = [f"{begins + i / 200 / 86400:.9f};{i % 7};{i % 5};{i % 3}" for i in range(400)]
+    (tmp_path / "run.csv").write_text("\n".join(["time;table;top;force", ";g;mm/s²;kN", *rows]), encoding="utf-8")
+    assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(200, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     "change",
     [
