@@ -305,7 +305,8 @@ def test_right_gains_and_modes_below_the_lines_take_no_constants_off(records):
     assert not np.any(whole_fit(above).constants)
 
 
-def test_what_ends_the_search_beside_free_gains_keeps_the_fit_at_hand(records, monkeypatch):
+def test_what_ends_the_search_beside_free_gains_or_is_not_likelier_keeps_the_fit_at_hand(records, monkeypatch):
+    """Of free gains that are not likelier nothing is fitted again."""
     fit = whole_fit(misread(records, ERROR * np.eye(6)[0]))
     wrong = dataclasses.replace(fit, test=misread(records, ERROR * np.eye(6)[0]), constants=np.zeros(1))
 
@@ -319,3 +320,9 @@ def test_what_ends_the_search_beside_free_gains_keeps_the_fit_at_hand(records, m
     assert np.any(fit.constants) and ended(InputError("no mode stands out")) is wrong
     stopped = ended(KeyboardInterrupt())
     assert stopped.stopped and stopped.test is wrong.test and stopped.parameters is wrong.parameters
+    given = dataclasses.replace(wrong.test, gain_std=np.full(fit.model.n, 0.05))
+    p = dataclasses.replace(wrong.parameters, gains=np.zeros(fit.model.n))
+    free = dataclasses.replace(wrong, chi2=2 * wrong.chi2, test=given, parameters=p)
+    monkeypatch.setattr("sysid.modal_analysis.fit._whole_fit", lambda *_: free)
+    monkeypatch.setattr("sysid.modal_analysis.fit.refitted", lambda *_, **__: pytest.fail("fitted again"))
+    assert _beside_free_gains(wrong, FitMonitor()) is wrong

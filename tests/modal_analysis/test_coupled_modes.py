@@ -9,7 +9,7 @@ import pytest
 import sysid
 from sysid.jobs.changes import drawn_from
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.coupled_modes import passive
+from sysid.modal_analysis.coupled_modes import passive, score_of_couplings
 from sysid.modal_analysis.coupled_spectra import CoupledLines
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.modal_estimate import Coupling
@@ -157,6 +157,17 @@ def test_modes_that_no_damper_couples_have_the_same_equations_by_either_way(forc
     np.testing.assert_allclose(other.gradient / size, one.gradient / size, atol=1e-8)
     assert other.chi2 == pytest.approx(one.chi2, rel=1e-12)
     np.testing.assert_allclose(model.gradient(replace(p, coupling=np.zeros((3, 3))), levels).gradient, other.gradient)
+
+
+@pytest.mark.parametrize("last, count", [(4.0, 2), (9.0, 3)])
+def test_couplings_of_modes_above_the_lines_with_each_other_are_not_asked_for(last, count):
+    """They mimic what is missing of modes above; of three modes one is within 4 Hz, two within 9 Hz."""
+    test = record(truth := building(), 0.005, np.random.default_rng(3), samples=600)
+    test = test.at(test.freq <= last)
+    model = RecordModel(test, 3, coupled=True)
+    p = replace(beside(truth, model), coupling=None)
+    levels = np.ones((1, model.channels + 1))
+    assert score_of_couplings(model, model.normal_equations(p, levels), p)[1] == count
 
 
 def test_steps_along_the_scale_of_a_mode_change_no_motion_and_others_are_sums_to_first_order():

@@ -91,6 +91,13 @@ def test_a_fit_finds_the_delay_that_was_left_in():
     assert abs(found.values[1] - 0.1 * MS) < 4 * found.std[1]
 
 
+def test_delays_are_put_back_only_where_the_fit_is_no_worse_without_them(monkeypatch):
+    """Of a model that misses much all deviations are large."""
+    known = delays_of
+    monkeypatch.setattr("sysid.modal_analysis.fit.delays_of", lambda fit: replace(known(fit), std=np.ones(5)))
+    assert np.count_nonzero(known(whole_fit(record([0, 0.3 * MS, 0, 0, 0]), np.zeros(5))).values) == 1
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_channels_on_one_clock_have_no_delay(seed):
     for test in (spectra(np.zeros(5), seed), record(np.zeros(5), seed)):
