@@ -11,8 +11,9 @@ import sysid
 from benchmarks.line import Line
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
+from sysid.modal_analysis.least_squares import unit_diagonal
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, unit_diagonal
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
 
 WITHIN = 1.5
 MODES = np.array([3.75, 11.2, 16.6])  # Hz, bending along X, by others

@@ -12,20 +12,11 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.misfit import at_lines, left_of
 from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
-from sysid.modal_analysis.record_fit import (
-    ROUGH,
-    TRIAL,
-    WHOLE,
-    Limits,
-    RecordFit,
-    half_inverse,
-    refitted,
-    rough_levels,
-    unit_diagonal,
-)
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, refitted, rough_levels
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import half_inverse, score, unit_diagonal
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
 from sysid.modal_analysis.model_order import (
@@ -24,17 +25,7 @@ from sysid.modal_analysis.model_order import (
     misses_modes_above,
     with_static_modes,
 )
-from sysid.modal_analysis.record_fit import (
-    ROUGH,
-    TRIAL,
-    RecordFit,
-    half_inverse,
-    refitted,
-    score,
-    unit_diagonal,
-    without,
-    worth,
-)
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, refitted, without, worth
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.structure.simulation import ModalModel
 from sysid.structure.structure import Array

@@ -32,6 +32,7 @@ from sysid.modal_analysis.model_order import (
 )
 from sysid.modal_analysis.record_fit import (
     ROUGH,
+    TRIAL,
     RecordFit,
     at_all_lines,
     on_turned,
@@ -197,7 +198,9 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 if left is None or (times > 1 and not np.any(new)):
                     continue
                 monitor.doing, turned = "delays", without_delays(test, total)
-                trial = _whole_fit(turned, monitor) if np.any(new) else on_turned(fit, turned, monitor=monitor)
+                beside = fit.static > 0 or not np.any(new)  # what stands for modes above is not looked for anew
+                trial = on_turned(fit, turned, monitor=monitor) if beside else _whole_fit(turned, monitor)
+                trial = _with_all_modes(trial, monitor) if beside and np.any(new) else trial
                 if trial.schwarz - fit.schwarz >= times * _price(total, delays, fit):
                     fit, delays = trial, total
                     break
@@ -269,7 +272,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         monitor.doing = "all lines"
         fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
         monitor.keep(fit)
-        return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
+        return _with_all_modes(fit, monitor)  # weak ones show on all lines only
     fit = _fitted(_rough_fit(test, monitor), monitor) if first is None else first
     monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
@@ -289,8 +292,9 @@ def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordF
     return pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
 
 
-def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
-    """The fit with couplings, then further modes that are worth it, without spurious ones; `some` as in `refitted`."""
+def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
+    """The fit with couplings, then further modes that are worth it, without spurious ones."""
+    some = None if np.all(lines := decimated_lines(fit.test)) else fit.test.at(lines)
     fit = with_couplings(fit, lambda rough: pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
     monitor.keep(fit)
     if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
@@ -313,7 +317,11 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
         last = 2 * np.pi * fit.test.freq[-1]
         if same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
             return beside
-    fit = pruned(refitted(fit, fit.parameters, monitor=monitor), monitor)
+    if beside is not None:
+        fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
+        if fit.likelihood < beside.likelihood:  # without the modes that chance explains it would be less
+            return beside
+    fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
     return fit
 
@@ -405,12 +413,6 @@ def _calibrated(fit: RecordFit, stated: Calibration, monitor: FitMonitor | None)
         return calibrated, found
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True), stated
-
-
-def of_calibrated_lines(modal: ModalEstimate, calibration: Calibration) -> ModalEstimate:
-    """The estimate of lines from which nothing was taken off yet, without these errors of their gains."""
-    turned = ModalEstimate.of_lines(calibration.taken_off(modal.records))
-    return replace(turned, delays=modal.delays, calibration=calibration)
 
 
 def fit_tests(

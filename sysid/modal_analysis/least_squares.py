@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton steps (Levenberg-Marquardt) on normal equations, of modes of whole records and of spectra."""
+"""Damped Gauss-Newton steps (Levenberg-Marquardt) on normal equations, and scores of further unknowns by these."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 _DAMPING = (1e-12, 1e-6, 1e6)  # of a scaled normal matrix: least, at first, and at which no step helps
 
@@ -107,3 +109,31 @@ def _step(scaled: Array, damping: float, gradient: Array) -> Array:
             damping = max(10 * damping, 1e-12)
             continue
         return np.asarray(scipy.linalg.cho_solve(factor, gradient))
+
+
+def unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (p, p) divided so that its diagonal is one, and the roots of the diagonal that it had, (p,)."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return normal / np.outer(size, size), size
+
+
+def half_inverse(normal: Array, least: float) -> Array:
+    """H with ``H H'`` the inverse of a scaled normal matrix, but for what shows by less than `least` of the most."""
+    lam, V = np.linalg.eigh(normal)
+    seen = lam > least * lam.max(initial=0.0)
+    return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
+
+
+def score(equations: NormalEquations, added: NDArray[np.bool_]) -> tuple[float, int]:
+    """Fall of twice the sum of squares that `added` unknowns (p,) promise in one step, and how many of them show.
+
+    The score has half the normal matrix for its covariance (C. R. Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50-57).
+    """
+    N, size = unit_diagonal(equations.normal)
+    gradient = equations.gradient / size
+    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
+    across = half.T @ N[np.ix_(~added, added)]
+    left = gradient[added] - across.T @ (half.T @ gradient[~added])
+    lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
+    seen = lam > ROUND_OFF
+    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))

@@ -200,6 +200,11 @@ class ModalEstimate:
             np.zeros(test.n_runs), gain,
         )  # fmt: skip
 
+    def without_errors(self, calibration: Calibration) -> ModalEstimate:
+        """That of lines from which nothing was taken off yet, without these errors of their gains."""
+        turned = ModalEstimate.of_lines(calibration.taken_off(self.records))
+        return replace(turned, delays=self.delays, calibration=calibration)
+
     @property
     def by_modes(self) -> bool:
         """True where the statistics of its modes stand for the lines."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes, held_gauge
 from sysid.modal_analysis.modal_model import Lines
 from sysid.modal_analysis.record_fit import (
@@ -28,11 +29,9 @@ from sysid.modal_analysis.record_fit import (
     WHOLE,
     Limits,
     RecordFit,
-    half_inverse,
     joint_worth,
     record_modes,
     refitted,
-    unit_diagonal,
     without,
     worth,
 )
@@ -173,6 +172,8 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         if peak is None:
             return fit
         more = refitted(fit, with_peak(fit, fit.parameters, peak), limits=TRIAL, monitor=monitor)
+        if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley
+            more = refitted(more, more.parameters, limits=TRIAL._replace(rounds=24), monitor=monitor)
         omega = more.parameters.modes.omega[: -fit.static]
         stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
         if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):

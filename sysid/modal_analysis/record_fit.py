@@ -20,7 +20,7 @@ from sysid.measurement.gains import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
+from sysid.modal_analysis.least_squares import SumOfSquares, half_inverse, minimise, unit_diagonal, units_of
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.modal_model import ModeLaw, trace_count
 from sysid.modal_analysis.noise_levels import (
@@ -38,6 +38,7 @@ from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
+_SETTLED_IN_LINES = 1e-2  # the same by modes within the lines, where those above them still move
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
@@ -342,7 +343,10 @@ def _minimise(
     counts: tuple[int, int],
     equations: _Equations,
 ) -> tuple[Parameters, float, bool]:
-    """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most."""
+    """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most.
+
+    Beside static modes others above the lines are no modes of the structure: the end need not be theirs.
+    """
     done, most = counts
 
     def tell(i: int, _: Parameters, chi2: float) -> bool:
@@ -353,13 +357,16 @@ def _minimise(
         model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
         lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
     )  # fmt: skip
-    return minimise(problem, tell, most, lambda _: _SETTLED)
+    p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
+    return p, chi2, ended or (model.static > 0 and equations.promised_in_lines(p, levels) < _SETTLED_IN_LINES)
 
 
 class _Equations:
     """Normal equations of one fit; their matrix is kept as long as parameters and levels hardly move.
 
-    Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time.
+    Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time. The
+    logarithm of a damping ratio above the lines, beside static modes, counts as known to `known` at least: it hardly
+    shows, and steps of any size hold up those of all others.
     """
 
     def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
@@ -367,16 +374,30 @@ class _Equations:
         self.at: tuple[Parameters, Array] | None = None
         self.normal: Array = np.zeros((0, 0))
 
-    def __call__(self, p: Parameters, levels: Array, near: float = 0.2) -> NormalEquations:
+    def __call__(self, p: Parameters, levels: Array, near: float = 0.2, known: float = 3.0) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
         still = self.at is not None and not self.model.laws  # of laws a gradient takes as long as the matrix
         if still and self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
+        ratios = np.r_[self.model.index.log_ratios][self.model.of_others(p)]
+        self.normal[ratios, ratios] = np.maximum(self.normal[ratios, ratios], known**-2)
         if self.of_matrix is not self.model:
             equations = self.model.gradient(p, levels)
         return equations._replace(normal=self.normal)
+
+    def promised_in_lines(self, p: Parameters, levels: Array) -> float:
+        """Fall of the sum of squares that a step promises where modes above the lines stay as they are."""
+        equations, model = self(p, levels), self.model
+        index, stays = model.index, model.of_others(p)
+        held = np.zeros(model.size, bool)
+        held[index.phi] = np.tile(stays, model.n)
+        held[index.gamma] = np.repeat(stays, model.d)
+        held[index.log_omega] = held[index.log_ratios] = stays
+        held[model.kept : model.kept + model.n_ends] = np.repeat(stays, model.n_ends // model.m)
+        normal, size = unit_diagonal(equations.normal[np.ix_(~held, ~held)])
+        return float(np.sum((half_inverse(normal, ROUND_OFF).T @ (equations.gradient[~held] / size)) ** 2))
 
     def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
         """The same with the matrix of these very parameters; None where it was."""
@@ -408,34 +429,6 @@ def _without_scale(normal: Array, scales: Array) -> Array:
     rows = np.divide(scales, unit, out=np.zeros_like(scales), where=unit > 0)
     rows = np.divide(rows / np.linalg.norm(rows, axis=1, keepdims=True), unit, out=np.zeros_like(rows), where=unit > 0)
     return normal + rows.T @ rows
-
-
-def unit_diagonal(normal: Array) -> tuple[Array, Array]:
-    """A normal matrix (p, p) divided so that its diagonal is one, and the roots of the diagonal that it had, (p,)."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return normal / np.outer(size, size), size
-
-
-def half_inverse(normal: Array, least: float) -> Array:
-    """H with ``H H'`` the inverse of a scaled normal matrix, but for what shows by less than `least` of the most."""
-    lam, V = np.linalg.eigh(normal)
-    seen = lam > least * lam.max(initial=0.0)
-    return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
-
-
-def score(equations: NormalEquations, added: NDArray[np.bool_]) -> tuple[float, int]:
-    """Fall of twice the sum of squares that `added` unknowns (p,) promise in one step, and how many of them show.
-
-    The score has half the normal matrix for its covariance (C. R. Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50-57).
-    """
-    N, size = unit_diagonal(equations.normal)
-    gradient = equations.gradient / size
-    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
-    across = half.T @ N[np.ix_(~added, added)]
-    left = gradient[added] - across.T @ (half.T @ gradient[~added])
-    lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
-    seen = lam > ROUND_OFF
-    return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))
 
 
 def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:

@@ -198,6 +198,11 @@ class RecordModel(SpectralModel):
         turns = self.static * (self.static - 1) // (2 if self.force else 1)
         return self.size - int(np.sum(self.held)) - (0 if self.force else self.m) - turns - self.by_gains.shape[2]
 
+    def of_others(self, p: Parameters) -> NDArray[np.bool_]:
+        """True for modes above the lines beside static modes, (m,), which stand for others."""
+        above = p.modes.omega > 2 * np.pi * self.test.freq[-1]
+        return above & (np.arange(self.m) < self.m - self.static) & (self.static > 0)
+
     def scales(self, p: Parameters) -> Array:
         """Moves of all unknowns that change nothing, (k, size): without a force, shape against load of each mode."""
         rows, index = np.zeros((0 if self.force else self.m, self.size)), self.index

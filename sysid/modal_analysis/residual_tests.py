@@ -26,9 +26,10 @@ from sysid.measurement.gains import without_constants
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import half_inverse, score, unit_diagonal
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, score, unit_diagonal
+from sysid.modal_analysis.record_fit import RecordFit, refitted
 from sysid.modal_analysis.record_model import Parameters, Run
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF, beyond_chance, most_deviations

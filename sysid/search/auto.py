@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError, Stop, refuse
 from sysid.finding import Finding
-from sysid.modal_analysis.fit import of_calibrated_lines
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import HUBER, loss, whitened
 from sysid.modal_analysis.response import predicted
@@ -167,7 +166,7 @@ def within_tolerances(
             stated, found = first[at].calibration, shown(one, its)
             assert stated is not None
             likely = stated.given(one.records, found.error, found.std)
-            modal[at] = of_calibrated_lines(first[at], likely)
+            modal[at] = first[at].without_errors(likely)
             std = np.sqrt(np.maximum(np.diag(likely.covariance), np.finfo(float).tiny))
             moved = max(moved, float(np.max(np.abs(likely.values - one.calibration.values) / std)))
         if moved < near:
