@@ -14,6 +14,8 @@ from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.stated import missed_values, stated_masses
 from sysid.search.strategy import Outcome
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
 
 def doubts(problem, structure, x):
     """Findings against a search that ended there, by the stated values and the records."""

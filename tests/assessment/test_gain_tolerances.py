@@ -15,6 +15,7 @@ from sysid.jobs.changes import drawn_from
 from sysid.measurement.clocks import without_delays
 from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
 from sysid.modal_analysis.calibration import Calibration
+from sysid.modal_analysis.delays import find_delays
 from sysid.modal_analysis.fit import _beside_free_gains, fit_modes, whole_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.model_order import Peak, with_peak
@@ -22,6 +23,7 @@ from sysid.modal_analysis.record_fit import on_turned
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import calibration_of
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 ERROR = 0.02
 TOLERANCES = {"gain_std": 0.005, "base_gain_std": 0.004, "force_gain_std": 0.003}
 
@@ -221,7 +223,8 @@ def test_functions_for_unit_motion_stay_so(spectra):
     np.testing.assert_allclose(unit.force, plain.force / (plain.base / moved.base), rtol=1e-8)
 
 
-def test_late_channels_are_found_beside_tolerances(spectra):
+def test_late_channels_are_found_beside_tolerances(spectra, monkeypatch):
+    monkeypatch.setattr("sysid.modal_analysis.delays.find_delays", find_delays)
     late = without_delays(spectra, -np.array([0.0, 0.002, 0.0, 0.0, 0.0]))
     errors = np.array([0.004, -0.003, 0.006, 0.0, 0.002, 0.0])
     result = sysid.identify(Problem(dataclasses.replace(misread(late, errors), **TOLERANCES)), rng=0)

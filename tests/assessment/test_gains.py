@@ -14,6 +14,7 @@ from sysid.assessment.checks.gains import distinct_poles, gain_errors
 from sysid.assessment.checks.stated import force_misfit
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 ERROR = 0.02
 
 
