@@ -113,13 +113,12 @@ class TestStatedMass:
         assert not told(result)
         assert f"sensor {sensor + 1}" in [one.channel for one in result.of_kind("gain", "rigid motion")]
 
-    @pytest.mark.parametrize("soft", [False, True])
-    def test_a_written_model_tells_it_too(self, soft):
-        truth, top = storeys(), storeys().natural_frequencies[-1]
-        test = on_bracket(shaken(truth), 2, 3 * top) if soft else shaken(truth)
+    def test_a_written_model_tells_it_too(self):
+        truth = storeys()
+        test = on_bracket(shaken(truth), 2, 3 * truth.natural_frequencies[-1])
         stated = {"mass": truth.mass[:4, :4], "stiffness": sysid.ChainStiffness(1e5, 1e6)}
         result = sysid.identify(Problem(test, **stated), rng=0)
-        assert [channel for channel, *_ in told(result)] == ["sensor 3"] * soft
+        assert [channel for channel, *_ in told(result)] == ["sensor 3"]
 
     def test_names_none_beside_a_free_mass_which_takes_it_up(self):
         test = on_bracket(shaken(storeys()), 2, 3 * storeys().natural_frequencies[-1])

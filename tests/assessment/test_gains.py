@@ -156,15 +156,19 @@ class TestEstimate:
         assert gain_errors(ModalEstimate.of_lines(misread(test, 0)), truth).of_base() is None
 
 
-@pytest.mark.parametrize("mass", [FullMass(), LumpedMass()], ids=["full", "lumped"])
-@pytest.mark.parametrize("noise", [0.0, 0.003])
-class TestAnswer:
-    @pytest.fixture
-    def answer(self, mass, noise):
-        truth = storeys()
-        test = simulate(truth, lines(truth), noise=noise, force=True, rng=0)
-        return truth, sysid.identify(Problem(misread(test, 1), mass=mass), rng=0)
+@pytest.fixture(scope="module", params=[0.0, 0.003])
+def noise(request):
+    return request.param
 
+
+@pytest.fixture(scope="module", params=[FullMass(), LumpedMass()], ids=["full", "lumped"])
+def answer(request, noise):
+    truth = storeys()
+    test = simulate(truth, lines(truth), noise=noise, force=True, rng=0)
+    return truth, sysid.identify(Problem(misread(test, 1), mass=request.param), rng=0)
+
+
+class TestAnswer:
     def test_tells_sensor_gain_and_remedy(self, answer, noise):
         _, result = answer
         (told,) = result.of_kind("gain")
