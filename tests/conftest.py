@@ -77,7 +77,7 @@ def _from_one_start():
 
 @pytest.fixture(scope="session")
 def from_one_start():
-    """Give a context in which "auto" begins at the guess alone, and other answers, delays, growing errors are no matter.
+    """Give a context: "auto" begins at the guess alone; other answers, delays, growing errors are not looked for.
 
     That takes a third of the time, and a tenth where exact records miss a model: what is left of them grows with the
     signal. Several starts are tested in tests/search/test_continuation.py and, on bundled problems, in
