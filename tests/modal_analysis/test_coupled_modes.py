@@ -19,6 +19,7 @@ from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.response import coupled_flexibility
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 RATE, LINES = 64.0, (0.5, 16.0)
 
 
