@@ -225,5 +225,5 @@ TRIED = (
     Mutant("K43", "a start is left out wherever another has been at the same step",
         "return any(apart(self.problem, x, way[step]) < SAME_ANSWER",
         "return any(apart(self.problem, x, way[step]) < 1e9",
-        "test_continuation"),
+        "test_continuation::test_a_start_comes_the_way_of_another_where_that_was_at_the_same_unknowns_after_the_same_step"),
 )  # fmt: skip

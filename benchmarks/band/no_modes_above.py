@@ -18,14 +18,14 @@ from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.older import COMMIT, answer_cases, workers
 
 STRUCTURES, DRAWS = range(8), 5
-SHORT, SHORT_DRAWS = (1, 6), 3
+SHORT, SHORT_DRAWS = (1, 6), 2
 NOISE, LOOSE = 0.01, 1e3
 LOSS = 1.05  # rms errors over those of an answer without residual modes
 MATRICES = ("mass", "stiffness", "damping")
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Five draws of each of eight structures; or three of two."""
+    """Five draws of each of eight structures; or two of two."""
     structures, draws = (SHORT, SHORT_DRAWS) if reduced else (STRUCTURES, DRAWS)
     tasks = [(seed, number) for seed in structures for number in range(draws)]
     with workers(Path(__file__)) as both:

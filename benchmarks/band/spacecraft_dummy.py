@@ -28,8 +28,8 @@ from benchmarks.line import Line, below
 from benchmarks.records.simulated import Modes
 
 DUMMIES, PATIENCE = range(5), 600  # s of processor time each
-SHORT, SHORT_PATIENCE = (103,), 120
-HALF = 100  # from this number on, less it: the same dummies tested to half the last line
+SHORT, SHORT_PATIENCE = (303,), 120
+LESS = 100  # the dummy of a number above is that of its last two digits, tested to a half, third, ... of the last line
 BAND = (5.0, 200.0)  # Hz
 NOISE, RATIOS = 0.01, (0.008, 0.02)
 LINES = 2000  # where base drives are compared
@@ -41,7 +41,7 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Five dummies to 200 Hz; or one to 100 Hz."""
+    """Five dummies to 200 Hz; or one to 50 Hz."""
     numbers = list(SHORT if reduced else DUMMIES)
     found = figures_of_each("band.spacecraft_dummy", numbers, SHORT_PATIENCE if reduced else PATIENCE)
     high = dummy(numbers[0]).lines[1]
@@ -145,7 +145,7 @@ def properties(rigid_body_mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 def dummy(number: int) -> Continuous:
     """Spacecraft dummy `number`, always the same: dimensions and masses are drawn about those of a small spacecraft."""
-    times, number = divmod(number, HALF)
+    times, number = divmod(number, LESS)
     rng = np.random.default_rng((number, 14))
     driven, sensors = spacecraft(rng)
     omega, shapes = driven.modes()

@@ -27,7 +27,7 @@ from sysid.jobs.submission import FILE_NAME as LEDGER
 from sysid.jobs.submission import Ledger
 from sysid.results.checkpoint import Checkpoint
 
-SECONDS, REDUCED = 600.0, 2.5  # a reader
+SECONDS, REDUCED = 600.0, 1.5  # a reader
 HANGS = 5.0  # s, from which one input counts as a hang
 MEMORY = 500.0  # MB that all of it may add to the process
 

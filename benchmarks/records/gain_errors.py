@@ -96,8 +96,9 @@ def misread(case: Case, sensor: int) -> tuple[str, Case]:
 
 def wrong_cases(reduced: bool) -> Iterator[tuple[str, Case]]:
     """Random structures with full masses; buildings with lumped masses and as chains; and which sensor is wrong."""
-    for seed in range(4 if reduced else RANDOM):
-        for noise in NOISE:
+    for seed in range(1, 4) if reduced else range(RANDOM):
+        # Without noise poles are sought down to round-off, which takes ten times as long.
+        for noise in NOISE[1:] if reduced and seed < 3 else NOISE:
             case = of_random(seed, noise)
             yield misread(case, seed % case.truth.n)
     for seed in range(1 if reduced else STOREYS):

@@ -20,7 +20,7 @@ ORDER = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)]
 COUNTS = (3, 4, 5, 6)
 DEVIATION = 0.003  # of the root of two diagonals
 RISE, COVERAGE = 1.05, (0.93, 0.97)
-FEW = (0.75, 1.25)  # rms of errors over stated deviations of 16 draws, which scatters by 0.08; too few for a coverage
+FEW = (0.75, 1.25)  # rms of errors over stated deviations of 10 draws, which scatters by 0.1; too few for a coverage
 WRONG = 8.0  # combined deviations
 STRUCTURES = (1, 2, 3, 5)  # seeds of structures that three weighed masses determine
 ACCUSED = 1e-3
@@ -57,7 +57,7 @@ class Draw:
 
 def lines(reduced: bool) -> Iterator[Line]:
     """Paired draws over some structures; only the worst figures are held to bounds."""
-    count = 16 if reduced else 200
+    count = 10 if reduced else 200
     structures = STRUCTURES[:2] if reduced else STRUCTURES
     answers = spread(draw, [(structures[number % len(structures)], number) for number in range(count)])
     what = f"{count} paired draws of full 3 x 3 masses, 1 % noise, no force: "

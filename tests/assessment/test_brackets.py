@@ -1,6 +1,7 @@
 """A sensor on a soft bracket is named, with the bracket's frequency, where redundancy shows it; others are not."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, LumpedMass, Problem, Sensor, Structure, simulate
 from sysid.assessment.checks.brackets import Misfit, beside_rigid, softest
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 KIND = "soft bracket"
 NOISE = 0.003
 
@@ -76,8 +78,20 @@ def told(result):
     return [(one.channel, one.numbers["frequency"], one.numbers["std"]) for one in result.of_kind(KIND)]
 
 
+@functools.cache
+def lumped(rng):
+    """The answer of a right test of the storeys, whose mass is said to be diagonal."""
+    return sysid.identify(Problem(shaken(storeys(), rng=rng), mass=LumpedMass()), rng=0)
+
+
+@functools.cache
+def rigid(rng):
+    """The answer of a right test of the block, whose sensors are said to be on one rigid part."""
+    return sysid.identify(Problem(shaken(*block(), rng=rng)), rng=0)
+
+
 class TestStatedMass:
-    @pytest.mark.parametrize(("sensor", "times"), [(0, 2.0), (1, 2.0), (2, 4.0), (3, 4.0)])
+    @pytest.mark.parametrize(("sensor", "times"), [(1, 2.0), (3, 4.0)])
     def test_names_the_sensor_and_its_bracket(self, sensor, times):
         truth = storeys()
         soft = times * truth.natural_frequencies[-1]
@@ -88,8 +102,7 @@ class TestStatedMass:
 
     @pytest.mark.parametrize("seed", range(3))
     def test_names_none_of_a_right_test(self, seed):
-        result = sysid.identify(Problem(shaken(storeys(), rng=seed), mass=LumpedMass()), rng=0)
-        assert result.determined and not told(result)
+        assert lumped(seed).determined and not told(lumped(seed))
 
     @pytest.mark.parametrize("sensor", [0, 3])
     def test_leaves_a_gain_a_gain(self, sensor):
@@ -100,13 +113,12 @@ class TestStatedMass:
         assert not told(result)
         assert f"sensor {sensor + 1}" in [one.channel for one in result.of_kind("gain", "rigid motion")]
 
-    @pytest.mark.parametrize("soft", [False, True])
-    def test_a_written_model_tells_it_too(self, soft):
-        truth, top = storeys(), storeys().natural_frequencies[-1]
-        test = on_bracket(shaken(truth), 2, 3 * top) if soft else shaken(truth)
+    def test_a_written_model_tells_it_too(self):
+        truth = storeys()
+        test = on_bracket(shaken(truth), 2, 3 * truth.natural_frequencies[-1])
         stated = {"mass": truth.mass[:4, :4], "stiffness": sysid.ChainStiffness(1e5, 1e6)}
         result = sysid.identify(Problem(test, **stated), rng=0)
-        assert [channel for channel, *_ in told(result)] == ["sensor 3"] * soft
+        assert [channel for channel, *_ in told(result)] == ["sensor 3"]
 
     def test_names_none_beside_a_free_mass_which_takes_it_up(self):
         test = on_bracket(shaken(storeys()), 2, 3 * storeys().natural_frequencies[-1])
@@ -128,7 +140,7 @@ class TestRigidPart:
     @pytest.mark.parametrize("seed", range(2))
     def test_names_none_of_a_right_test_nor_where_no_part_is_stated(self, seed):
         truth, sensors = block()
-        assert not told(sysid.identify(Problem(shaken(truth, sensors, rng=seed)), rng=0))
+        assert not told(rigid(seed))
         loose = [dataclasses.replace(one, part="") for one in sensors]
         test = on_bracket(shaken(truth, loose, rng=seed), 0, 3 * truth.natural_frequencies[-1])
         assert not told(sysid.identify(Problem(test), rng=0))
@@ -188,8 +200,7 @@ class TestAssumptions:
         test = shaken(storeys())
         free = sysid.identify(Problem(test, mass=FullMass()), rng=0)
         assert self.kinds(free) == ["assumed force gain", "assumed mounting", "assumed base"]
-        lumped = sysid.identify(Problem(test, mass=LumpedMass()), rng=0)
-        assert "assumed mass" in self.kinds(lumped) and "assumed mounting" not in self.kinds(lumped)
+        assert "assumed mass" in self.kinds(lumped(0)) and "assumed mounting" not in self.kinds(lumped(0))
         assert not set(self.kinds(free)) & {one.kind for one in free.findings}
 
     def test_a_goal_that_is_met_makes_a_bracket_a_caution(self):
@@ -199,15 +210,14 @@ class TestAssumptions:
 
     def test_leave_out_mountings_that_a_rigid_part_tells(self):
         truth, sensors = block()
-        result = sysid.identify(Problem(shaken(truth, sensors)), rng=0)
-        assert "assumed mounting" not in self.kinds(result)
+        assert "assumed mounting" not in self.kinds(rigid(0))
         three = [*sensors[:3], dataclasses.replace(sensors[3], part="")]
         (one,) = [one for one in sysid.identify(Problem(shaken(truth, three)), rng=0).assumptions
                   if one.kind == "assumed mounting"]  # fmt: skip
         assert one.numbers == {"sensors": 4.0}
 
     def test_stand_in_summary_and_file_and_are_read_again(self, tmp_path):
-        result = sysid.identify(Problem(shaken(storeys()), mass=LumpedMass()), rng=0)
+        result = lumped(0)
         assert [one["kind"] for one in result.to_dict()["assumptions"]] == self.kinds(result)
         assert result.summary().count("assumed: ") == len(result.assumptions)
         assert sysid.load(result.save(tmp_path)).assumptions == result.assumptions
@@ -228,7 +238,7 @@ class TestToleranceOfGains:
     @pytest.mark.parametrize("soft", [False, True])
     def test_beside_a_diagonal_mass_of_whole_records_the_bracket_alone_is_told(self, soft):
         setting, rng = four_storeys(), np.random.default_rng(0)
-        records, _ = setting.with_noise(setting.run(rng, 60.0).records(), rng)
+        records, _ = setting.with_noise(setting.run(rng, 30.0).records(), rng)
         runs = [(records.base, records.response * self.GAINS[:, None], None)]
         test = sysid.Measurement.from_time(runs, records.sample_rate, rigid_body=np.ones((4, 1)), band=setting.lines)
         frequency = 4 * setting.structure.natural_frequencies[-1]

@@ -92,7 +92,7 @@ def test_a_mistake_in_all_sensors_and_another_in_one_are_both_told():
     assert found[0].numbers["factor"] == pytest.approx(1 / 9.80665, rel=0.03)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_right_records_are_accused_of_nothing(seed):
     truth = random_structure(seed, n=3 + seed % 6, d=1 + seed % 3)
     f, noise = truth.natural_frequencies, (0.0, 0.003, 0.03)[seed % 3]

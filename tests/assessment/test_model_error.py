@@ -13,6 +13,8 @@ from sysid.assessment.checks.context import BEYOND, misses_of, noise_at_most
 from sysid.assessment.checks.model_error import changing
 from sysid.measurement.in_time import as_whole, cut_in_motion, peaks, quiet_levels, runs_in_time
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
+
 
 def identified(test, **options):
     return sysid.identify(sysid.Problem(test, mass=sysid.FullMass(), **options), rng=0)

@@ -9,6 +9,7 @@ import sysid
 from sysid import Problem, Sensor
 from sysid.structure.sensor import BaseSensor
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 HEIGHTS = np.array([0.6, 1.1, 1.9, 2.4])
 MASS = np.array([4.0, 3.0, 5.0, 2.0])
 K = 5000.0 * np.array([[2.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]])

@@ -12,7 +12,7 @@ from sysid.cli import main as cli
 from sysid.files.recorded_test import RecordedTest
 from sysid.modal_analysis.fit import fit_modes
 
-RATE, N = 50.0, 6000
+RATE, N = 50.0, 4000
 TRUTH = sysid.Structure(
     np.diag([3.0, 2.0, 0.0]), [[8e3, -3e3, -5e3], [-3e3, 3e3, 0], [-5e3, 0, 5e3]], [0.02, 0.02], n_base=1
 )

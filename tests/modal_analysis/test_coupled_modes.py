@@ -19,6 +19,7 @@ from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.response import coupled_flexibility
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 RATE, LINES = 64.0, (0.5, 16.0)
 
 
@@ -41,7 +42,7 @@ def modes_of(structure):
     return modes, loss - np.diag(np.diag(loss))
 
 
-def record(structure, noise, rng, *, samples=3000, force=True):
+def record(structure, noise, rng, *, samples=2000, force=True):
     """A record of random motion, cut in motion: cosines that are no lines of it, each by a direct solve."""
     period = 7919  # a prime, longer than the record
     w = 2 * np.pi * np.arange(period // 2 + 1) * RATE / period

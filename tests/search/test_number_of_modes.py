@@ -14,7 +14,8 @@ from sysid.modal_analysis.modal_fit import modes_within
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.structure.structure import Structure
 
-pytestmark = pytest.mark.usefixtures("fitted_once")  # how many modes are asked for comes after it
+# How many modes are asked for comes after the fit of the records.
+pytestmark = pytest.mark.usefixtures("fitted_once", "from_one_start_in_module")
 
 M, K = np.array([2.0, 3.0, 2.5, 4.0, 3.0, 2.0]), np.array([5.0, 4.0, 4.5, 3.0, 3.5, 2.5]) * 1e4
 N, AT = M.size, np.array([0, 2, 3, 5])

@@ -7,6 +7,7 @@ import pytest
 
 import sysid
 
+pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 FREQ = np.linspace(0.4, 8.0, 200)
 ONE = (np.array([100.0]), np.array([[4e4]]))
 TWO = (np.array([100.0, 80.0]), 4e4 * np.array([[2.0, -1], [-1, 1]]))
