@@ -255,12 +255,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     asked = context.problem.stated.amplitude
     if asked is None:
         return
-    if not context.modal.laws and context.modal.stopped:
-        sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
-        yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
-    elif not context.modal.laws:
-        sentence = "laws of amplitude are left out: they are of modes, or by levels of modes, that the answer has not"
-        yield Finding("amplitude open", Severity.CAUTION, sentence, "ask for more modes")
+    if not context.modal.laws:
+        why = "the search was stopped" if context.modal.stopped else "the answer has not the modes that they need"
+        sentence, remedy = f"laws of amplitude are left out, as {why}", "let it end, or ask for more modes"
+        yield Finding("amplitude open", Severity.CAUTION, sentence, remedy)
     frequencies = context.end.structure.natural_frequencies
     near = [(law, law.mode_among(frequencies, 0.25)) for law in context.modal.laws]
     for law, mode in ((law, k + 1) for law, k in near if k is not None):  # `judge` tells of the others
