@@ -73,6 +73,52 @@ class Storeys:
         relative = np.stack(accelerations, axis=-1)
         return np.asarray((self.modes[1] @ relative if self.kind == "law" else relative) + bases[:, None])
 
+    def steady(self, levels: Array, cycles: int = 200, steps: int = 80) -> tuple[Array, Array]:
+        """Frequency, Hz, and damping ratio of the first mode at levels, (l,), m/s², as steady motion shows them.
+
+        The level is that of the mode at the floor where its shape is largest. The base moves against the velocity of
+        the mode, at constant strength, until the motion is steady: at resonance by its phase, which is stable also
+        where a hardening mode has two motions under one sine. Runge-Kutta steps of fourth order.
+        """
+        (w, phi), n = self.modes, self.mass.size
+        size, load = np.abs(phi[:, 0]).max(), float(phi[:, 0] @ self.mass)  # of either sign
+        slope, h = self._modal_slope() if self.kind == "law" else self._slope(), 2 * np.pi / w[0] / steps
+        row = np.eye(n)[0] if self.kind == "law" else phi[:, 0] * self.mass
+        strength = 2 / (load * size) * np.geomspace(0.3 * levels.min() * 0.005, 3 * levels.max() * 0.1, 24)
+
+        def driven(y: Array) -> tuple[Array, Array, Array]:
+            q, v = row @ y[:n], row @ y[n : 2 * n]
+            base = -strength * v / np.hypot(w[0] * q, v)
+            return slope(y, base), q, base
+
+        y = np.zeros((2 * n + n * (self.kind in YIELDING), strength.size))
+        y[n : 2 * n] = 1e-3 * (phi[:, [0]] if self.kind != "law" else row[:, None])
+        motion, bases = np.empty((2, cycles * steps, strength.size))
+        with np.errstate(over="ignore", invalid="ignore"):  # a spring that softens may be driven over its top
+            for i in range(cycles * steps):
+                a, motion[i], bases[i] = driven(y)
+                b = driven(y + h / 2 * a)[0]
+                c = driven(y + h / 2 * b)[0]
+                y = y + h / 6 * (a + 2 * b + 2 * c + driven(y + h * c)[0])
+        held = np.all(np.isfinite(motion), axis=0)
+        found = np.empty((3, np.count_nonzero(held)))
+        t = h * np.arange(20 * steps)
+        for k, (q, base) in enumerate(zip(motion[-t.size :, held].T, bases[-t.size :, held].T, strict=True)):
+            up = np.flatnonzero((q[:-1] < 0) & (q[1:] >= 0))
+            at = t[up] - h * q[up] / (q[up + 1] - q[up])
+            omega = 2 * np.pi * (at.size - 1) / (at[-1] - at[0])
+            whole = (t >= at[0]) & (t < at[-1])
+            turn = np.exp(-1j * omega * t[whole])
+            amplitude, moved = (2 * np.abs(np.mean(turn * one[whole])) for one in (q, base))
+            found[:, k] = (
+                size * omega**2 * amplitude,
+                omega / (2 * np.pi),
+                abs(load) * moved / (2 * omega**2 * amplitude),
+            )
+        order = np.argsort(found[0])
+        level, f, zeta = found[:, order]
+        return np.interp(np.log(levels), np.log(level), f), np.interp(np.log(levels), np.log(level), zeta)
+
     def _slope(self) -> Callable[[Array, Array], Array]:
         """Of displacements, velocities and, where springs yield, their drifts, all (n, r)."""
         (w, phi), M, n, k = self.modes, np.diag(self.mass), self.mass.size, self.stiffness[:, None]

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 import sysid
-from benchmarks.amplitude.softening_storeys import AT, FALL, LEVELS, RISE, Kind, recorded, shaken, storeys
+from benchmarks.amplitude.softening_storeys import (
+    AT,
+    FALL,
+    LEVELS,
+    RATE,
+    RISE,
+    YIELDING,
+    Array,
+    Kind,
+    Storeys,
+    recorded,
+    shaken,
+    storeys,
+)
 from benchmarks.line import Line, above, below
 
 NOISE = 0.01
@@ -17,16 +31,21 @@ def lines(reduced: bool) -> Iterator[Line]:
     """40 structures of five kinds, 60 linear ones, 20 tests that leave a law open; reduced: one, one and one."""
     seconds = 25.0 if reduced else 60.0
     kinds: list[Kind] = ["law", "duffing", "friction", "bilinear", "bouc-wen"]
-    predicted, off = [], []
-    for seed in range(1 if reduced else 40):
-        ratio, deviations = _predicted(kinds[seed % 5], seed, seconds)
-        predicted.append(ratio)
-        off += deviations
-    share = float(np.mean(np.array(predicted) <= 0.5))
+    found = [_predicted(kinds[seed % 5], seed, seconds) for seed in range(1 if reduced else 40)]
+    predicted = [one.ratio for one in found if one.ratio is not None]
+    if predicted:
+        yield above(
+            f"unseen runs of {len(predicted)} of {len(found)} structures, of which a linear model misses over five "
+            f"times the noise: share missed at most half as much as by it (largest {max(predicted):.2g})",
+            float(np.mean(np.array(predicted) <= 0.5)), 0.95,
+        )  # fmt: skip
+    within = float(np.mean([one.off <= 1 for one in found]))
     yield above(
-        f"unseen runs of {len(predicted)} structures: share missed at most half as much as by the best linear model "
-        f"(largest {max(predicted):.2g})", share, 0.95,
+        f"f and zeta of mode 1 at three levels beside steady motion ({within:.2g} of the structures within 1 % and "
+        "10 %, where springs yield within 3 % and 25 %): share within, or misfit told",
+        float(np.mean([one.off <= 1 or one.told for one in found])), 1,
     )  # fmt: skip
+    off = [deviation for one in found for deviation in one.deviations]
     if off:
         rms = float(np.sqrt(np.mean(np.square(off))))
         yield below(f"stated laws: rms of {len(off)} errors over their deviations", rms, 2.0 if reduced else 1.2)
@@ -38,27 +57,56 @@ def lines(reduced: bool) -> Iterator[Line]:
     )
 
 
-def _predicted(kind: Kind, seed: int, seconds: float) -> tuple[float, list[float]]:
-    """Error for an unseen run over that of the linear model; errors of a stated law over their deviations."""
+class Predicted(NamedTuple):
+    """Error for an unseen run over that of the linear model, where that misses over five times the noise, else None.
+
+    The largest error of frequency or damping at three levels over its bound, and whether a misfit is told; errors of
+    the numbers of a stated law over their deviations.
+    """
+
+    ratio: float | None
+    off: float
+    told: bool
+    deviations: list[float]
+
+
+def _predicted(kind: Kind, seed: int, seconds: float) -> Predicted:
     rng = np.random.default_rng(seed)
     structure = storeys(kind, rng, 3 + seed // 5 % 4 if seconds > 30 else 2)
     bases = np.array([shaken(level, seconds, rng) for level in (*LEVELS, 1.7)])
     runs = list(zip(bases, structure.under(bases), strict=True))
     test, (base, truth) = recorded(runs[:3], NOISE, rng), runs[3]
-    unseen = recorded([(base, truth)], 0.0, rng)
     plain = sysid.identify(sysid.Problem(test), rng=0)
     result = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw()), rng=0)
-    missed = [np.linalg.norm(one.predict(unseen) - unseen.relative) for one in (result, plain)]
+    # In time: spectra of a run that ends in motion hold its end, which no linear model in the lines foresees.
+    missed = [float(np.linalg.norm(one.structure.simulate(base[None], RATE) - truth)) for one in (result, plain)]
+    noise = NOISE * np.hypot(np.linalg.norm(truth), np.sqrt(len(truth)) * np.linalg.norm(base))
+    ratio = missed[0] / missed[1] if missed[1] > 5 * noise else None
+    told = any(one.kind in ("least squares", "noise left", "changing") for one in result.findings)
+    off = _off_at_levels(structure, result.structure, runs[:3])
     if kind != "law" or not result.structure.laws:
-        return float(missed[0] / missed[1]), []
-    (law,) = result.structure.laws
+        return Predicted(ratio, off, told, [])
+    law = result.structure.laws[0]
     if law.form[:2] != (0.5, 1.0):
-        return float(missed[0] / missed[1]), []
+        return Predicted(ratio, off, told, [])
     scale = AT / law.form.level
     w, _ = structure.modes
     truth_of = np.array([*np.log([w[0] / (2 * np.pi), structure.ratios[0]]), FALL / np.sqrt(scale), RISE / scale])
     found = np.array([*np.log([law.frequency, law.ratio]), *law.values])
-    return float(missed[0] / missed[1]), list((found - truth_of) / np.sqrt(np.diag(law.covariance)))
+    return Predicted(ratio, off, told, list((found - truth_of) / np.sqrt(np.diag(law.covariance))))
+
+
+def _off_at_levels(truth: Storeys, found: sysid.Structure, runs: list[tuple[Array, Array]]) -> float:
+    """Largest error of frequency and damping of the first mode at the rms level of each run, over its bound."""
+    shape = truth.modes[1][:, 0]
+    size, row = np.abs(shape).max(), shape * truth.mass
+    levels = np.array([size * np.sqrt(2) * np.std(row @ (response - base)) for base, response in runs])
+    at = [(found.natural_frequencies[0], found.damping_ratios[0])] * len(runs)
+    for law in found.laws:
+        if law.mode == 0:
+            at = [law.at(level * abs(shape[law.sensor]) / size) for level in levels]
+    bounds = np.array([0.03, 0.25] if truth.kind in YIELDING else [0.01, 0.1])
+    return float(np.max(np.abs(np.array(at) / np.transpose(truth.steady(levels)) - 1) / bounds))
 
 
 def _kinds(kind: Kind, seed: int, levels: tuple[float, ...], seconds: float, noise: float = NOISE) -> str:

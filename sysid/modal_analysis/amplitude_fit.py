@@ -91,11 +91,12 @@ def _stages(
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
         if left_of(best) < much:
-            monitor.doing = "noise of all channels"
+            monitor.doing, most = "noise of all channels", 1.1 * left_of(best)
             noisy = _with_noise(best, _with_equivalents(best), ROUGH, monitor)
-            if left_of(noisy) < 1.1 * left_of(best):  # else noise of the base takes what laws miss
-                best = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
-                linear = _with_noise(best, linear.parameters, TRIAL, monitor)
+            if left_of(noisy) < most:  # else noise of the base takes what laws miss, or, at the end, then
+                noisy = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
+            if left_of(noisy) < most:
+                best, linear = noisy, _with_noise(noisy, linear.parameters, TRIAL, monitor)
                 if not fit.model.whole.plain:  # what it explains by noise of the base may have taken many steps
                     linear = max(linear, fit, key=lambda one: one.likelihood)
     if plain or len(best.parameters.laws) > 1:
@@ -132,8 +133,7 @@ def _with_law_of(
         for exponent in (one for one in each if one != first[number]):
             monitor.doing = f"{which}, exponent {exponent:g} {LawForm._fields[number].replace('_', ' ')}"
             found = refitted(best, _with_exponent(best, number, exponent), limits=limits, monitor=monitor)
-            if found.likelihood > best.likelihood:
-                best = found
+            best = max(best, found, key=lambda one: one.likelihood)
         yield best
 
 
@@ -263,14 +263,13 @@ def _started(
         form = LawForm(*exponents, float(np.concatenate(_envelopes(fit, mode, sensor)).max()))
         law = ModeLaw(mode, sensor, form, np.zeros(2), ones)
     else:
-        first = p.laws[0]
-        law = ModeLaw(mode, first.sensor, first.form, first.values, ones, level_of=first.followed)
-    for values in [np.array([fall, 0.0]) for fall in tries] or [law.values]:
+        law = p.laws[0]._replace(mode=mode, equivalent=ones, likelier=False, level_of=p.laws[0].followed)
+    for values in [np.array([fall, 0.0]) for fall in tries] or [law.values, 0 * law.values]:
         law = law._replace(values=values)
         modes = p.modes._replace(omega=p.modes.omega * np.where(followed, 1 + values[0] / 2, 1.0))
         begun = replace(p, modes=modes, ends=ends, laws=(*p.laws, law))
         found.append(refitted(fit, begun, limits=ROUGH, monitor=monitor))
-        if found[-1].settled:
+        if found[-1].settled and (tries or found[-1].likelihood > fit.likelihood):
             break
     best = max(found, key=lambda one: one.likelihood)
     return refitted(best, _with_equivalents(best), limits=limits, monitor=monitor)
@@ -338,7 +337,7 @@ def _envelopes(fit: RecordFit, mode: int, sensor: int) -> list[Array]:
 
 def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
     """The laws of a fit, with the covariance of frequency, damping and law, as wide as what is left says."""
-    model, p, found = fit.model, fit.parameters, []
+    model, index, p, found = fit.model, fit.model.index, fit.parameters, []
     if not p.laws:
         return ()
     N, size = unit_diagonal(fit.normal[: model.n_fit, : model.n_fit])
@@ -346,8 +345,7 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
     covariance = half @ half.T / np.outer(size, size) / 2 * _shared(fit)
     first = model.of_laws.start
     for law in p.laws:
-        poles = model.index.log_omega.start, model.index.log_ratios.start
-        at = [*(start + law.mode for start in poles), *range(first, first + law.form.size)]
+        at = [index.log_omega.start + law.mode, index.log_ratios.start + law.mode, *range(first, first + law.form.size)]
         first += law.form.size
         pole = float(p.modes.omega[law.mode] / (2 * np.pi)), float(p.modes.ratios[law.mode])
         other = 0.0 if law.level_of is None else float(p.modes.omega[law.level_of] / (2 * np.pi))

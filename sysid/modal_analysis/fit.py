@@ -486,7 +486,7 @@ def estimate(fit: RecordFit, calibration: Calibration | None = None) -> ModalEst
     ])  # fmt: skip
     grows = fit.model.whole.grows  # lines that stand for themselves hold no transients
     there = np.ones(m, bool) if fit.kept is None else fit.kept
-    laws = (law for law, of in zip(fitted_laws(fit), p.laws, strict=True) if there[of.mode])
+    laws = (law for law, of in zip(fitted_laws(fit), p.laws, strict=True) if there[of.mode] and there[of.followed])
     found = ModalEstimate(
         replace(fit.test, whole=None) if grows else fit.test, without_transients(fit),
         *modes.at(order), p.rigid,

@@ -54,31 +54,33 @@ class LawMotions:
             self._series[run, times] = np.fft.irfft(spectrum, fine)
         return times, self._series[run, times]
 
-    def added(self, p: Parameters, run: Run, law: ModeLaw) -> ComplexArray:
-        """What a law adds at the lines of a part of a run."""
-        return self.of_run(p, run.number, law)[:, run.among(self.lines[run.number])]
+    def added(self, p: Parameters, run: Run, law: ModeLaw, *, slopes: bool) -> ComplexArray:
+        """What a law adds at the lines of a part of a run, with derivatives or without."""
+        return self.of_run(p, run.number, law, slopes=slopes)[:, run.among(self.lines[run.number])]
 
-    def of_run(self, p: Parameters, run: int, law: ModeLaw) -> ComplexArray:
-        """What a law adds at all lines of a run."""
+    def of_run(self, p: Parameters, run: int, law: ModeLaw, *, slopes: bool = False) -> ComplexArray:
+        """What a law adds at all lines of a run, with derivatives or, (1, L), without."""
         modes, k, d, rest = p.modes, law.mode, p.modes.gamma.shape[1], self.at_rest[run]
-        spectra = np.fft.rfft(self._moved(p, run, law)[0])[:, self.places(run)] / self.rate
+        spectra = np.fft.rfft(self._moved(p, run, law, slopes)[0])[:, self.places(run)] / self.rate
         w, base, ends = 2 * np.pi * self.lines[run], self.base[run], self._ends(p, run, k)
         pole = np.array([[modes.omega[k]], [modes.ratios[k]]]) * law.equivalent[run][:, None]
         g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], *pole)
         transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
         load = modes.gamma[k] @ base + ends @ transients
+        if not slopes:
+            return np.asarray(spectra - (modes.gamma[k] @ base + g[0] * load))
         for at in (1, 6 + d + law.form.size)[: 2 - (law.level_of is None)]:
             spectra[at : at + 2] = np.zeros((2, w.size)) if rest else spectra[[at + 1, at]]
         linear = [modes.gamma[k] @ base + g[0] * load, *g[0] * transients, *base + g[0] * base]
         spectra[: 5 + d] -= [*linear, by_omega * load, by_ratio * load]
         return np.asarray(spectra)
 
-    def _moved(self, p: Parameters, run: int, law: ModeLaw) -> tuple[Array, Array]:
+    def _moved(self, p: Parameters, run: int, law: ModeLaw, slopes: bool) -> tuple[Array, Array]:
         """Rows of `motion` at the samples of a run, and its level at all steps; those of the last numbers are kept."""
         modes, k, level = p.modes, law.mode, None
         times, series = self.in_time(run, k, float(modes.omega[k]))
         if law.level_of is not None:  # straight from step to step of the mode that it is of
-            level, fine = self._moved(p, run, law.moving(p.laws))[1], np.arange(series.shape[1])
+            level, fine = self._moved(p, run, law.moving(p.laws), slopes)[1], np.arange(series.shape[1])
             at = np.minimum(fine / fine.size * level.shape[1], level.shape[1] - 1.0)
             first = at.astype(int)
             rest = at - first
@@ -86,11 +88,12 @@ class LawMotions:
         pole = np.log([modes.omega[k], modes.ratios[k], abs(modes.phi[law.sensor, k])])
         numbers, ends = np.append(pole, law.values), self._ends(p, run, k)
         key = np.concatenate([[times, *law.form], modes.gamma[k], ends, numbers, *(() if level is None else level[:2])])
-        if (run, k) not in self._last or not np.array_equal(self._last[run, k][0], key):
+        which = run, k, slopes
+        if which not in self._last or not np.array_equal(self._last[which][0], key):
             load, step = modes.gamma[k] @ series, 1 / (self.rate * times)
-            rows, levels = motion(law.form, load, step, numbers, ends[::-1], series, level)
-            self._last[run, k] = key, rows[:, ::times], levels
-        return self._last[run, k][1:]
+            rows, levels = motion(law.form, load, step, numbers, ends[::-1], series if slopes else None, level)
+            self._last[which] = key, rows[:, ::times], levels
+        return self._last[which][1:]
 
     def _ends(self, p: Parameters, run: int, mode: int) -> Array:
         """Numbers of the ends of a run of a mode, (2,)."""
@@ -101,8 +104,8 @@ class LawMotions:
 @functools.lru_cache(maxsize=1)
 def _motions_of(
     test: Measurement,
-) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int], tuple[Array, Array, Array]]]:
-    """Motions of the base in time, by run and steps a sample, and the last of modes, by run and mode: of all models."""
+) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int, bool], tuple[Array, Array, Array]]]:
+    """Motions of the base, by run and steps a sample; last ones of modes, by run, mode, and whether with slopes."""
     return {}, {}
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -381,23 +380,22 @@ class LawChunk(Chunk):
         """See `Lines`."""
         return linear_modes(p, run.number)
 
-    @cached_property
-    def added(self) -> list[ComplexArray]:
-        """What each law adds."""
-        motions = self.records.law_motions
-        return [] if motions is None else [motions.added(self.p, self.run, law) for law in self.p.laws]
+    def added(self, *, slopes: bool) -> list[ComplexArray]:
+        """What each law adds, with derivatives or without, as of steps that are refused."""
+        run, motions = self.run, self.records.law_motions
+        return [motions.added(self.p, run, law, slopes=slopes) for law in self.p.laws if motions is not None]
 
     def motion_of(self, base: ComplexArray) -> ComplexArray:
         """See `Lines`."""
         motion = super().motion_of(base)
-        for law, added in zip(self.p.laws, self.added, strict=True):
+        for law, added in zip(self.p.laws, self.added(slopes=False), strict=True):
             motion[law.mode] += added[0]
         return motion
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """See `Chunk`; last, law by law, come derivatives by the logarithm of the size of the shape, and by the law."""
-        plain, ends = super().spectra(base), self.at_ends is not None
-        return np.concatenate([plain, *add_laws(plain, self.p.laws, self.added, self.p.modes.gamma.shape, ends=ends)])
+        plain, ends, added = super().spectra(base), self.at_ends is not None, self.added(slopes=True)
+        return np.concatenate([plain, *add_laws(plain, self.p.laws, added, self.p.modes.gamma.shape, ends=ends)])
 
     def entries(self, channel: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Array]]:
         """See `Chunk`."""

@@ -228,7 +228,7 @@ def _step(z: ca.SX, first: ca.SX, last: ca.SX, h: ca.SX, w: ca.SX, zeta: ca.SX) 
 
 @functools.cache
 def _recursion(form: LawForm, steps: int, directions: int, given: int) -> ca.Function:
-    """The motion over all steps; with `directions` of the base, its derivatives too.
+    """The motion over all steps, with its level; with `directions` of the base, their derivatives too.
 
     These are by the first state, by the participation in each direction, by the numbers of the mode, and by those that
     a level depends upon which is given at each step's end: it and its derivatives are so many rows, none of an own one.
@@ -239,7 +239,8 @@ def _recursion(form: LawForm, steps: int, directions: int, given: int) -> ca.Fun
     after, restoring = step(state, load, h, p)
     after = ca.vertcat(after[:2], level[:1]) if given else after
     if not directions:
-        return ca.Function("once", [state, load, level, h, p], [after, restoring]).mapaccum("motion", steps)
+        both = [after, ca.vertcat(restoring, state[2])]
+        return ca.Function("once", [state, load, level, h, p], both).mapaccum("motion", steps)
     others = max(given - 1, 0)
     moves, motions = ca.SX.sym("S", 3, 2 + directions + p.numel() + others), ca.SX.sym("U", 2, directions)
     of_level = ca.vertcat(ca.SX.zeros(2, others), level[1:].T) if given else ca.SX.zeros(3, 0)
@@ -247,7 +248,8 @@ def _recursion(form: LawForm, steps: int, directions: int, given: int) -> ca.Fun
     moved = ca.jacobian(after, state) @ moves + direct
     by = ca.jacobian(restoring, state) @ moves
     by += ca.horzcat(ca.SX.zeros(1, 2 + directions), ca.jacobian(restoring, p), ca.SX.zeros(1, others))
-    outputs = [ca.horzcat(after, moved), ca.horzcat(restoring, by)]
+    rows = ca.vertcat(ca.horzcat(restoring, by), ca.horzcat(state[2], moves[2, :]))
+    outputs = ca.cse([ca.horzcat(after, moved), rows])
     once = ca.Function("once", [ca.horzcat(state, moves), load, level, motions, h, p], outputs)
     return once.mapaccum("motion", steps)
 
@@ -293,9 +295,9 @@ def motion(
         state[2] = 0.0
         state[2, [0, *range(state.shape[1] - len(given) + 1, state.shape[1])]] = given[:, 0]
     moved = _recursion(form, load.size, d, len(given))
-    states, rows = moved(state, np.stack([load, _next(load)]), _next(given), *beside, step, numbers)
-    after = np.asarray(states[2, :].full()).reshape(load.size, -1)
-    return np.asarray(rows.full()).reshape(load.size, -1).T, np.vstack([state[2], after[:-1]]).T
+    rows = moved(state, np.stack([load, _next(load)]), _next(given), *beside, step, numbers)[1].full()
+    both = np.asarray(rows).reshape(2, load.size, -1)
+    return both[0].T, both[1].T
 
 
 def _next(rows: Array) -> Array:

@@ -22,7 +22,7 @@ from sysid.modal_analysis.amplitude_fit import (
     fitted_laws,
     with_laws,
 )
-from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
@@ -391,6 +391,15 @@ def test_spectra_have_no_amplitude():
     test = sysid.simulate(one, np.linspace(1, 10, 50))
     with pytest.raises(sysid.InputError, match="whole records"):
         sysid.Problem(test, amplitude=sysid.AmplitudeLaw())
+
+
+def test_a_law_by_the_level_of_a_mode_that_the_estimate_has_not_is_left_out(test):
+    """The second mode follows the first: it may stay without a law, and the first may stay alone."""
+    fit = record_modes(test, OMEGA, RATIOS)
+    law = ModeLaw(1, 1, LawForm(0.5, 1.0, 10.0), np.array([0.02, 0.003]), np.ones((2, 2)), level_of=0)
+    fit = replace(fit, parameters=replace(fit.parameters, laws=(law,)))
+    for kept, laws in (((True, True), 1), ((False, True), 0), ((True, False), 0)):
+        assert len(estimate(replace(fit, kept=np.array(kept))).laws) == laws
 
 
 def test_a_law_of_a_mode_that_the_answer_has_not_is_told_and_left_out():

@@ -256,8 +256,9 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     if asked is None:
         return
     if not context.modal.laws:
-        sentence = "whether modes follow their amplitude was not looked for, as the search was stopped before"
-        yield Finding("amplitude open", Severity.CAUTION, sentence, "let it end, or give it more time")
+        why = "the search was stopped" if context.modal.stopped else "the answer has not the modes that they need"
+        sentence, remedy = f"laws of amplitude are left out, as {why}", "let it end, or ask for more modes"
+        yield Finding("amplitude open", Severity.CAUTION, sentence, remedy)
     frequencies = context.end.structure.natural_frequencies
     near = [(law, law.mode_among(frequencies, 0.25)) for law in context.modal.laws]
     for law, mode in ((law, k + 1) for law, k in near if k is not None):  # `judge` tells of the others
