@@ -38,7 +38,6 @@ from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
-_SETTLED_IN_LINES = 1e-2  # the same by modes within the lines, where those above them still move
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
@@ -358,7 +357,7 @@ def _minimise(
         lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
     )  # fmt: skip
     p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
-    return p, chi2, ended or (model.static > 0 and equations.promised_in_lines(p, levels) < _SETTLED_IN_LINES)
+    return p, chi2, ended or (model.static > 0 and equations.promised_in_lines(p, levels) < 10 * _SETTLED)
 
 
 class _Equations:
