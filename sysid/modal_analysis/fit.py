@@ -311,7 +311,7 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
     """The fit, settled, without modes that noise explains.
 
     Where a few steps lead to the modes of the fit `beside` within the lines, and to as many, it is the same: poles
-    beyond the lines, which hardly show, move until the end.
+    beyond the lines, which hardly show, move until the end. Some more steps show whether others are likelier.
     """
     if beside is not None and beside.settled and beside.model.m == fit.model.m and beside.schwarz >= fit.schwarz:
         last = 2 * np.pi * fit.test.freq[-1]

@@ -478,7 +478,7 @@ def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, f
 
 def _of_others(fit: RecordFit) -> NDArray[np.bool_]:
     """True for static modes, and beside them for all above the lines: they stand for others, and need not show."""
-    return (fit.static > 0) & (fit.parameters.modes.omega > 2 * np.pi * fit.test.freq[-1])
+    return fit.model.of_others(fit.parameters) | (np.arange(fit.model.m) >= fit.model.m - fit.static)
 
 
 def _least(fit: RecordFit) -> NDArray[np.bool_]:
