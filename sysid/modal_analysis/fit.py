@@ -208,8 +208,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 break
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
-            kept = np.where(certain, delays, 0.0)
-            fewer = on_turned(fit, without_delays(test, kept), monitor=monitor)
+            fewer = on_turned(fit, without_delays(test, kept := np.where(certain, delays, 0.0)), monitor=monitor)
             fit = fewer if fewer.schwarz + _price(delays, kept, fit) > fit.schwarz else fit
         return fit if fit is found else without_weak_modes(fit, monitor)  # which was done there
     except (Stop, KeyboardInterrupt):
@@ -319,7 +318,8 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
             return beside
     if beside is not None:
         fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
-        if fit.likelihood < beside.likelihood:  # without the modes that chance explains it would be less
+        fewer = min(fit.model.unknowns - beside.model.unknowns, 0)  # further modes may go, and add no likelihood
+        if fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood:
             return beside
     fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)
