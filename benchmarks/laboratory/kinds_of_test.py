@@ -21,7 +21,7 @@ from benchmarks.laboratory.kinds import KINDS
 from benchmarks.line import Line, above, below
 
 DRAWS, DRAWN = 20, 100
-SHORT = {"building": (1,), "weighed": (2,)}  # draws of those that take few seconds
+SHORT = {"building": (1,), "weighed": (2,), "stepped": (3,)}  # draws of those that take few seconds
 PATIENCE, SHORT_PATIENCE = 240, 40  # s of processor time of one command
 SECONDS = 60.0  # of processor time, a run
 SHARE, OF_NUMBERS = 0.95, 0.99
@@ -31,7 +31,7 @@ SIZE, SIZE_OF_H1 = (0.8, 1.3), (0.5, 1.5)  # rms of errors over deviations
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Twenty draws of each kind; or one of two kinds."""
+    """Twenty draws of each kind; or one of three kinds."""
     asked = SHORT if reduced else dict.fromkeys(KINDS, range(DRAWS))
     patience = SHORT_PATIENCE if reduced else PATIENCE
     for kind, draws in asked.items():

@@ -135,7 +135,7 @@ def rate_of(time: Array, path: Path, place: str) -> float:
     """
     refuse((time.size < 3, f"{path}: {time.size} samples are no record: is it the right file, and whole?"))
     day = 86400.0
-    if time[0] > 1e4 and abs(time[-1] - time[0]) < 1e-5 * time.size:  # days, as spreadsheets count them
+    if time[0] > 1e4 and 0 < time[-1] - time[0] < 1e-5 * time.size:  # days, as spreadsheets count them
         time = time * day
     time = time + day * np.cumsum(np.diff(time, prepend=time[0]) < -0.99 * day)
     falls = np.flatnonzero(np.diff(time) <= 0)

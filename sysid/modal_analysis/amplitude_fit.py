@@ -93,7 +93,7 @@ def _stages(
         if left_of(best) < much:
             monitor.doing, most = "noise of all channels", 1.1 * left_of(best)
             noisy = _with_noise(best, _with_equivalents(best), ROUGH, monitor)
-            if left_of(noisy) < most:  # else noise of the base takes what laws miss, or, at the end, then
+            if left_of(noisy) < most:  # else noise of the base takes what laws miss: asked again at the end
                 noisy = refitted(noisy, _with_equivalents(noisy), limits=WHOLE, monitor=monitor)
             if left_of(noisy) < most:
                 best, linear = noisy, _with_noise(noisy, linear.parameters, TRIAL, monitor)

@@ -84,7 +84,7 @@ def with_couplings(
     model, equations, (promised, count) = _asked(fit)
     beyond = max(fit.reduced, 1.0)
     above = (np.arange(model.size) >= model.n_fit + model.n * model.d) & (np.arange(model.size) < model.delays)
-    if promised < beyond * beyond_chance(count):
+    if promised <= beyond * beyond_chance(count):
         return fit
     # What modes above the lines leave would pass for couplings of those that stand for them.
     hidden = promised < score(equations, above)[0]
@@ -104,8 +104,8 @@ def with_couplings(
         more = max(more, other, key=lambda one: one.schwarz)
     if not more.settled:
         more = refitted(more, more.parameters, some=some, monitor=monitor)
-    gained = 2 * (more.likelihood - fit.likelihood)
-    least = np.sign(max(count := more.model.unknowns - fit.model.unknowns, 0)) * beyond_chance(abs(count))
+    gained = 2 * (more.likelihood - plain.likelihood)
+    least = np.sign(max(count := more.model.unknowns - plain.model.unknowns, 0)) * beyond_chance(abs(count))
     single = more.parameters.coupling is None  # where one mode is left
     if single or not (
         more.settled and passive(more.parameters, 2 * np.pi * fit.test.freq[-1]) and gained > beyond * least

@@ -145,7 +145,7 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
         gain = gain_errors_of(replace(free := _whole_fit(given, monitor), constants=std * free.parameters.gains))
         count, apart = np.count_nonzero(gain.certain), gain.error - gain.error[np.argmax(np.abs(gain.certain))]
         several = count == 2 or np.any((gain.certain != 0) & (np.abs(apart) > most_deviations(n) * gain.std))
-        worth = free.schwarz - (price := count * np.log(fit.model.numbers) / 2)
+        worth = free.schwarz + np.sum(free.parameters.gains**2) / 2 - (price := count * np.log(fit.model.numbers) / 2)
         # An axis or a sign makes larger errors; and what free gains do not make likelier, these alone do not either.
         if (below and several) or np.max(np.abs(gain.certain)) > 3 * std or worth <= fit.schwarz:
             return fit
@@ -184,7 +184,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     """The fit without the delays that it finds itself, as long as these make it likelier.
 
     Those that the first modes show are taken off before any others are looked for, which would stand for them. Modes
-    are looked for anew where a channel is late that was not before. Delays that chance explains are put back.
+    are looked for anew where a channel is newly late. Those that chance explains are put back, unless that is worse.
     """
     delays, first = _first_delays(test, delays, monitor)
     fit = found = _whole_fit(without_delays(test, delays), monitor, first)

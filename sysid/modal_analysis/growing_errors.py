@@ -28,24 +28,21 @@ def may_grow(test: Measurement, least: int = 32) -> bool:
     return test.freq.size >= least and bool(np.all(test.own_lines)) and not (test.averaged or stated)
 
 
-def errors_grow(test: Measurement, poles: Poles, much: float = 5.0, least: float = 2e-5, smooth: float = 0.5) -> bool:
+def errors_grow(test: Measurement, poles: Poles, much: float = 5.0, least: float = 2e-5) -> bool:
     """True where what free residues at the poles leave grows with what the sensors record, beyond chance.
 
     By ranks (Spearman 1904), which outliers do not sway: of independent errors of one size the correlations of all
     sensors and runs have a mean of zero, and about `much` deviations tell that they grow. What leaves less than `least`
-    of the motion is exact. Where errors of neighbouring lines have one phase, `smooth` of them on average, they are a
-    curve that the modes miss.
+    of the motion is exact.
     """
     residues, left = linear_residues(test, poles.omega, poles.ratios)
     if left < least:
         return False
     motion = np.einsum("knd,kf,rdf->rnf", residues, gains(test.freq, poles.omega, poles.ratios), test.base)
     errors = test.relative - motion
-    turns = np.exp(1j * np.angle(errors))
-    curve = np.mean((turns[..., 1:] * turns[..., :-1].conj()).real) > smooth  # what the modes miss, no readings
     ranks = [_ranks(one) for one in (errors, test.response - errors)]
     along = np.mean(ranks[0] * ranks[1], axis=-1) * np.sqrt(test.freq.size - 1)
-    return bool(not curve and np.sum(along) > much * np.sqrt(along.size))
+    return bool(np.sum(along) > much * np.sqrt(along.size))
 
 
 def with_profile(fit: RecordFit, monitor: FitMonitor, rounds: int = 4, most: float = 0.03) -> RecordFit:

@@ -365,7 +365,7 @@ class _Equations:
 
     Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time. The
     logarithm of a damping ratio above the lines, beside static modes, counts as known to `known` at least: it hardly
-    shows, and steps of any size hold up those of all others.
+    shows, and a long step of it would be refused with those of all others.
     """
 
     def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
@@ -395,6 +395,7 @@ class _Equations:
         held[index.gamma] = np.repeat(stays, model.d)
         held[index.log_omega] = held[index.log_ratios] = stays
         held[model.kept : model.kept + model.n_ends] = np.repeat(stays, model.n_ends // model.m)
+        held[model.coupling] = np.any(stays[model.coupled], axis=1)
         normal, size = unit_diagonal(equations.normal[np.ix_(~held, ~held)])
         return float(np.sum((half_inverse(normal, ROUND_OFF).T @ (equations.gradient[~held] / size)) ** 2))
 

@@ -381,7 +381,7 @@ class LawChunk(Chunk):
         return linear_modes(p, run.number)
 
     def added(self, *, slopes: bool) -> list[ComplexArray]:
-        """What each law adds, with derivatives or without, as of steps that are refused."""
+        """What each law adds, with derivatives or, as where a step is tried, without."""
         run, motions = self.run, self.records.law_motions
         return [motions.added(self.p, run, law, slopes=slopes) for law in self.p.laws if motions is not None]
 

@@ -16,14 +16,13 @@ from sysid.measurement.clocks import without_delays
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit import fit_modes
-from sysid.modal_analysis.growing_errors import errors_grow, scatter_of_lines
+from sysid.modal_analysis.growing_errors import scatter_of_lines
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.noise_levels import _designs, _likelihood, _parts
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import delays_of
-from sysid.modal_analysis.vector_fitting import Poles
 
 SHARES = 0.003, 0.01
 
@@ -263,19 +262,3 @@ def test_frequency_responses_of_two_directions_read_to_half_a_per_cent_have_thei
     errors = (answer.structure.natural_frequencies - f) / answer.uncertainty.natural_frequencies
     assert np.all(np.abs(errors) < 4)
     assert all(one["percent_of_signal"] == pytest.approx(0.5, rel=0.2) for one in answer.to_dict()["noise"])
-
-
-@pytest.mark.parametrize(("read", "loss", "grow"), [(0.003, 0.0, True), (0.0, 0.04, False)])
-def test_what_modes_miss_of_exact_records_are_no_errors_of_readings(read, loss, grow) -> None:
-    """A loss factor of the springs, which no damping ratio has, is missed by a curve that is largest at the peaks."""
-    rng, freq = np.random.default_rng(8), np.linspace(1.0, 20.0, 300)
-    storeys = np.eye(4, 5) - np.eye(4, 5, k=-1) - np.outer(np.eye(4)[0], np.eye(5)[4])
-    truth = sysid.Structure(np.eye(5), 3e3 * storeys.T @ storeys, np.full(4, 0.02), n_base=1)
-    exact = truth.transmissibility(freq)[None, :, 0]
-    if loss:
-        K = (1 + 1j * loss) * truth.stiffness[:4, :4]
-        moved = [np.linalg.solve(K - w**2 * np.eye(4), np.full(4, w**2)) for w in 2 * np.pi * freq]
-        exact = np.array(moved).T[None] + 1
-    response = exact * (1 + read * (rng.standard_normal((*exact.shape, 2)) @ [1, 1j]))
-    test = sysid.Measurement(freq, np.ones((1, 1, freq.size), complex), response, rigid_body=np.ones((4, 1)))
-    assert errors_grow(test, Poles(2 * np.pi * truth.natural_frequencies, truth.damping_ratios, 0.0)) is grow

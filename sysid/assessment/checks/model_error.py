@@ -256,8 +256,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     if asked is None:
         return
     if not context.modal.laws:
-        why = "the search was stopped" if context.modal.stopped else "the answer has not the modes that they need"
-        sentence, remedy = f"laws of amplitude are left out, as {why}", "let it end, or ask for more modes"
+        why, remedy = "the answer has not the modes that they need", "ask for more modes"
+        if context.modal.stopped:
+            why, remedy = "the search was stopped", "let it end"
+        sentence = f"laws of amplitude are left out, as {why}"
         yield Finding("amplitude open", Severity.CAUTION, sentence, remedy)
     frequencies = context.end.structure.natural_frequencies
     near = [(law, law.mode_among(frequencies, 0.25)) for law in context.modal.laws]
