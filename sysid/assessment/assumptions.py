@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.assessment.checks.brackets import parts_with_spare
 from sysid.finding import Finding, Severity
-from sysid.measurement.gains import tolerance_of
+from sysid.measurement.channels import tolerance_of
 from sysid.models.mass import LumpedMass
 from sysid.problem.prepared import Prepared
 from sysid.structure.sensor import BASE_AXES

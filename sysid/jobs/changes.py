@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, as_float, refuse, whole_number
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records, without_transients_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import refuse
-from sysid.measurement.gains import seen_at_sensors, tolerance_of, without_gains
+from sysid.measurement.channels import seen_at_sensors, tolerance_of, without_gains
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import most_deviations

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import factors_of_runs

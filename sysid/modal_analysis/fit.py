@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.errors import InputError, Stop
-from sysid.measurement.clocks import without_delays
-from sysid.measurement.gains import tolerance_of, without_constants
+from sysid.measurement.channels import tolerance_of, without_constants, without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.amplitude_fit import fitted_laws, with_laws
@@ -22,11 +21,11 @@ from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_prof
 from sysid.modal_analysis.misfit import deviations, left_of, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.model_order import (
+    least_of,
     least_worth,
     peaks_of,
     pruned,
     with_further_modes,
-    with_static_modes,
     without_spurious_modes,
     without_weak_modes,
 )
@@ -58,11 +57,13 @@ from sysid.modal_analysis.rough_poles import (
     at_few_lines,
     at_sines_alone,
     decimated_lines,
+    leads_to,
     rough_deviations,
     same_modes,
     steady_sine,
 )
 from sysid.modal_analysis.spectra_modes import strongest_poles
+from sysid.modal_analysis.static_modes import with_static_modes
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
 from sysid.structure.amplitude import AmplitudeLaw
@@ -312,14 +313,13 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
     Where a few steps lead to the modes of the fit `beside` within the lines, and to as many, it is the same: poles
     beyond the lines, which hardly show, move until the end. Some more steps show whether others are likelier.
     """
-    if beside is not None and beside.settled and beside.model.m == fit.model.m and beside.schwarz >= fit.schwarz:
-        last = 2 * np.pi * fit.test.freq[-1]
-        if same_modes(*(modes.at(modes.omega <= last) for modes in (beside.parameters.modes, fit.parameters.modes))):
-            return beside
     if beside is not None:
+        if beside.schwarz >= fit.schwarz and leads_to(beside, fit.parameters.modes):
+            return beside
         fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
         fewer = min(fit.model.unknowns - beside.model.unknowns, 0)  # further modes may go, and add no likelihood
-        if fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood:
+        worse = fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood
+        if worse or leads_to(beside, without(fit, least_of(fit)).modes):
             return beside
     fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.linalg import norm
 from numpy.typing import NDArray
 
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters
@@ -33,6 +34,9 @@ class SumOfSquares:
         The same where their matrix was that of other parameters close by, else None: asked for where a step fails.
     moved : callable
         Unknowns after a step: to first order their sum.
+    bent : callable or None
+        At parameters, whose unknowns are given too: the product of the Jacobian with what the errors bend by along a
+        step, by which a step in a curved valley follows it.
     """
 
     start: Array
@@ -41,6 +45,7 @@ class SumOfSquares:
     equations: Callable[[Parameters], NormalEquations]
     renewed: Callable[[Parameters], NormalEquations | None] = lambda _: None
     moved: Callable[[Array, Array], Array] = np.add
+    bent: Callable[[Parameters, Array, Array], Array] | None = None
 
 
 def minimise(
@@ -48,8 +53,13 @@ def minimise(
     tell: Callable[[int, Parameters, float], bool],
     most: int,
     settled: Callable[[float], float],
+    curved: float = 1e-7,
+    bends: float = 0.75,
 ) -> tuple[Parameters, float, bool]:
     """Parameters of the least sum of squares near the start, the sum, and whether the end was reached.
+
+    Steps are bent to second order where they are damped (geodesic acceleration: M. K. Transtrum, J. P. Sethna,
+    arXiv:1201.5885).
 
     Parameters
     ----------
@@ -60,6 +70,10 @@ def minimise(
         Steps.
     settled : callable
         The promised fall, of a sum of squares, at which the fit stands still.
+    curved : float
+        Damping above which steps are bent.
+    bends : float
+        Share of a step that its bend may be; where it is more, the step is too long.
     """
     least, damping, greatest = _DAMPING
     x, p = problem.start, problem.unpack(problem.start)
@@ -73,12 +87,17 @@ def minimise(
             unit = units_of(here.normal)
             scaled = here.normal * np.outer(unit, unit)
             step = _step(scaled, damping, here.gradient * unit) * unit
-            promised = float(here.gradient @ step)
-            there = problem.moved(x, step)
-            trial = problem.unpack(there)
-            after = problem.chi2(trial)
-            if after <= here.chi2 or promised < enough:
-                break
+            promised, long = float(here.gradient @ step), False
+            if problem.bent is not None and damping > curved:
+                second = _step(scaled, damping, problem.bent(p, x, step) * unit)
+                long = promised >= enough and norm(second) > bends * norm(step[unit > 0] / unit[unit > 0])
+                step = step + second * unit / 2
+            if not long:
+                there = problem.moved(x, step)
+                trial = problem.unpack(there)
+                after = problem.chi2(trial)
+                if after <= here.chi2 or promised < enough:
+                    break
             if (renewed := problem.renewed(p)) is not None:
                 here = renewed
                 continue

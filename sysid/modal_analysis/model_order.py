@@ -15,13 +15,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
-from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes, held_gauge
+from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes
 from sysid.modal_analysis.modal_model import Lines
 from sysid.modal_analysis.record_fit import (
     ROUGH,
@@ -44,7 +42,6 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
-_LIGHT = 0.1  # share of the spare mass that modes above the lines begin with
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
@@ -55,7 +52,11 @@ def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement
     worthiest alone. Where lines are many, `some` is the test at a few of them, as in `refitted`.
     """
     while True:
-        peaks = peaks_of(fit, least_worth(fit.model))[: fit.model.m]
+        beside_all = fit.static and fit.parameters.coupling is None  # poles above the lines came with static modes
+        most = 2 * np.pi * fit.test.freq[-1] if beside_all else np.inf
+        peaks = peaks_of(fit, least_worth(fit.model), within=(0.0, most))[: fit.model.m]
+        if not peaks:
+            return fit
         more = _with_peaks(fit, peaks, some, monitor)
         if more is None and len(peaks) > 1:
             more = _with_peaks(fit, peaks[:1], some, monitor)
@@ -113,122 +114,17 @@ def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> R
     return replace(fit, kept=~gone) if np.any(gone) else fit
 
 
-def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> RecordFit:
-    """The fit with as many modes as base directions at a far pole, held, where it misses what modes above add.
-
-    See `ModeFit.with_static` of spectra.
-    """
-    test, d = fit.test, fit.test.n_base
-    if fit.static or fit.stopped or not misses_modes_above(fit):
-        return fit
-    first, far = at_static_pole(fit), STATIC_POLE[0] * 2 * np.pi * float(test.freq[-1])
-    monitor = monitor or FitMonitor()
-    monitor.doing = "modes above the lines"
-    more = refitted(fit, first, monitor=monitor, static=d)
-    passed = lambda one: one.parameters.modes.omega > far * (1 + ROUND_OFF)  # noqa: E731
-    if np.any(passed(more)):  # they stand for what the static modes do
-        more = refitted(more, without(more, passed(more)), monitor=monitor)
-    unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
-    inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]
-    gained = 2 * (more.likelihood - fit.likelihood)
-    if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
-        return fit
-    return in_gauge(_with_poles_above(more, monitor))
-
-
-def misses_modes_above(fit: RecordFit) -> bool:
-    """True where what grows as w² in the sensors is left beyond chance."""
-    worth, rise = _rise(fit)
-    return worth >= beyond_chance(rise.size)
-
-
-def at_static_pole(fit: RecordFit) -> Parameters:
-    """Parameters of a fit with static modes at its end, which begin with what grows as w² in the sensors."""
-    p, d, rise = fit.parameters, fit.test.n_base, _rise(fit)[1]
-    times, ratio = STATIC_POLE
-    far = times * 2 * np.pi * float(fit.test.freq[-1])
-    p = without(fit, p.modes.omega >= far)
-    if fit.model.force:
-        spare = np.diag(p.rigid - p.modes.gamma.T @ p.modes.gamma)
-        gamma = np.sqrt(_LIGHT * np.maximum(spare, _LIGHT * np.diag(p.rigid)))
-    else:
-        gamma = np.sqrt(np.mean(p.modes.gamma**2, axis=0))
-    phi, held = times**2 * rise / gamma, np.full(d, far)
-    modes = p.modes.joined(Modes(phi, np.diag(gamma), held, np.full(d, ratio)))
-    return p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
-
-
-def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
-    """The fit with further poles between the last line and its static modes, by Akaike's criterion: they are no modes.
-
-    See `ModeFit.with_static` of spectra.
-    """
-    last, far = 2 * np.pi * fit.test.freq[-1] * np.array([1.0, STATIC_POLE[0]])
-    monitor.doing = "poles above the lines"
-    while True:
-        m = fit.model.m
-        price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
-        peak = next((one for one in peaks_of(fit, price) if last < one.omega < far), None)
-        if peak is None:
-            return fit
-        more = refitted(fit, with_peak(fit, fit.parameters, peak), limits=TRIAL, monitor=monitor)
-        if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley
-            more = refitted(more, more.parameters, limits=TRIAL._replace(rounds=24), monitor=monitor)
-        omega = more.parameters.modes.omega[: -fit.static]
-        stays = np.count_nonzero(omega < last) == np.count_nonzero(fit.parameters.modes.omega < last)
-        if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):
-            return fit
-        fit = more
-
-
-def _rise(fit: RecordFit) -> tuple[float, Array]:
-    """Chi-squared of what grows as w² in the sensors, which a fit follows; its size where none does, (n, d)."""
-    (n, d), equations = fit.test.rigid_body.shape, fit.equations
-    at = fit.model.size + n * d  # beside constants too, which wrong gains make
-    seen = slice(at + n * d)
-    normal, size = unit_diagonal(equations.normal[seen, seen])
-    half = half_inverse(normal[:at, :at], ROUND_OFF)
-    across, gradient = half.T @ normal[:at, at:], equations.gradient[seen] / size
-    left = gradient[at:] - across.T @ (half.T @ gradient[:at])
-    free, alone = (half_inverse(one, ROUND_OFF) for one in (normal[at:, at:] - across.T @ across, normal[at:, at:]))
-    worth = 2 * float(np.sum((free.T @ left) ** 2)) / max(fit.reduced, 1.0)
-    return worth, (alone @ (alone.T @ gradient[at:]) / size[at:]).reshape(n, d)
-
-
-def in_gauge(fit: RecordFit) -> RecordFit:
-    """The same fit, its static modes turned into each other to the form that `held_gauge` keeps."""
-    p, d = fit.parameters, fit.static
-    if not d:
-        return fit
-    last = p.modes.at(slice(-d, None))
-    gauge = held_gauge(last, np.ones(d), fit.model.force)[0]
-    phi = last.phi @ last.gamma @ np.linalg.inv(gauge)
-    modes = p.modes._replace(
-        phi=np.hstack([p.modes.phi[:, :-d], phi]), gamma=np.vstack([p.modes.gamma[:-d], gauge])
-    )  # fmt: skip
-    coupling = p.coupling
-    if coupling is not None:
-        turn = scipy.linalg.block_diag(np.eye(len(coupling) - d), gauge @ np.linalg.inv(last.gamma))
-        coupling = turn @ coupling @ turn.T
-    return replace(fit, parameters=replace(p, modes=modes, coupling=coupling))
-
-
-def without_static_modes(fit: RecordFit, *, monitor: FitMonitor) -> RecordFit:
-    """The fit without its static modes, for an answer whose modes are all its own."""
-    if not fit.static or fit.stopped:
-        return fit
-    return refitted(fit, without(fit, np.arange(fit.model.m) >= fit.model.m - fit.static), monitor=monitor, static=0)
-
-
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
     """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line.
 
-    And for those that drift makes: of less than two periods a record, or of four below the lines.
+    And for those that drift makes: of less than two periods a record, or of four below the lines. The width of modes
+    above the lines hardly shows.
     """
     modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
-    below = modes.omega < 2 * np.pi * fit.test.freq[0]
+    below, above = modes.omega < 2 * np.pi * fit.test.freq[0], modes.omega > 2 * np.pi * fit.test.freq[-1]
     slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
-    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
+    narrow = (modes.ratios * modes.omega < RAZOR * line) & ~above
+    return np.asarray((modes.ratios >= DAMPED) | narrow | slow)
 
 
 def least_worth(model: RecordModel) -> float:
@@ -347,13 +243,16 @@ def _add(trials: Trials, strength: Array, blocks: list[slice], chunk: Lines, lev
         strength[block] += total
 
 
-def peaks_of(fit: RecordFit, least: float, widths: float = 5.0) -> list[Peak]:
+def peaks_of(
+    fit: RecordFit, least: float, widths: float = 5.0, within: tuple[float, float] = (0.0, np.inf)
+) -> list[Peak]:
     """Modes that the errors of a fit hold, worth more than `least`, the worthiest first.
 
-    They are so many half-power widths apart.
+    They are so many half-power widths apart, and between two frequencies, rad/s.
     """
     trials = trials_of(fit)
     worth, shapes, loads = trials.likeliest()
+    worth[(trials.omega < within[0]) | (trials.omega > within[1])] = 0.0
     found: list[int] = []
     for at in np.argsort(-worth):
         if worth[at] <= least:
@@ -452,7 +351,7 @@ def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Ar
 
 def pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
     """The fit without modes that noise explains, several together where noise explains them all."""
-    while np.any(least := _least(fit)):
+    while np.any(least := least_of(fit)):
         fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
     return fit
 
@@ -481,7 +380,7 @@ def _of_others(fit: RecordFit) -> NDArray[np.bool_]:
     return fit.model.of_others(fit.parameters) | (np.arange(fit.model.m) >= fit.model.m - fit.static)
 
 
-def _least(fit: RecordFit) -> NDArray[np.bool_]:
+def least_of(fit: RecordFit) -> NDArray[np.bool_]:
     """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])

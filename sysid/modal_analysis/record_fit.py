@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import refuse
-from sysid.measurement.gains import without_constants
+from sysid.measurement.channels import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
@@ -341,20 +341,27 @@ def _minimise(
     monitor: FitMonitor,
     counts: tuple[int, int],
     equations: _Equations,
+    creeping: float = 1.0,
 ) -> tuple[Parameters, float, bool]:
     """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most.
 
-    Beside static modes others above the lines are no modes of the structure: the end need not be theirs.
+    Beside static modes others above the lines are no modes of the structure, and follow flat valleys: where a step
+    gains less than `creeping`, which no criterion would tell from none, the end need not be theirs.
     """
     done, most = counts
 
-    def tell(i: int, _: Parameters, chi2: float) -> bool:
+    before = np.inf
+
+    def tell(i: int, at: Parameters, chi2: float) -> bool:
+        nonlocal before
         monitor(done + i, float(np.sqrt(2 * chi2 / model.numbers)))
-        return False
+        creeps, before = model.static > 0 and before - chi2 < creeping, chi2
+        return creeps and equations.promised_in_lines(at, levels) < 10 * _SETTLED
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
         lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
+        (lambda *of_step: model.bent(levels, *of_step)) if model.static else None,
     )  # fmt: skip
     p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
     return p, chi2, ended or (model.static > 0 and equations.promised_in_lines(p, levels) < 10 * _SETTLED)

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.measurement.gains import without_constants
+from sysid.measurement.channels import without_constants
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
@@ -130,3 +131,10 @@ def same_modes(modes: Modes, poles: Poles | Modes) -> bool:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
     return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
+
+
+def leads_to(fit: RecordFit, modes: Modes) -> bool:
+    """True where a fit from these modes would end as this settled one: as many, and the same within the lines."""
+    last = 2 * np.pi * fit.test.freq[-1]
+    inside = (one.at(one.omega <= last) for one in (fit.parameters.modes, modes))
+    return fit.settled and fit.model.m == modes.omega.size and same_modes(*inside)

@@ -21,11 +21,12 @@ from sysid.modal_analysis.fit import estimate, fit_modes, fit_tests
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import modes_within
-from sysid.modal_analysis.model_order import with_so_many_modes, with_static_modes, without_static_modes
+from sysid.modal_analysis.model_order import with_so_many_modes
 from sysid.modal_analysis.outliers import Outlier, outliers, pseudo_values, screened
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import predicted
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
+from sysid.modal_analysis.static_modes import with_static_modes, without_static_modes
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
 from sysid.models.stiffness_and_damping import FREQUENCY_WINDOW

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError, refuse, shown
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.calibration import Calibration, calibrated, stored_calibrations
 from sysid.modal_analysis.delays import Delays, stored_delays

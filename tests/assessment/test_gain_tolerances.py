@@ -12,8 +12,7 @@ from sysid.assessment.checks.gains import GainErrors
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.errors import InputError
 from sysid.jobs.changes import drawn_from
-from sysid.measurement.clocks import without_delays
-from sysid.measurement.gains import read_by_gains, seen_at_sensors, without_gains
+from sysid.measurement.channels import read_by_gains, seen_at_sensors, without_delays, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import find_delays
 from sysid.modal_analysis.fit import _beside_free_gains, fit_modes, whole_fit

@@ -9,7 +9,7 @@ import sysid
 from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous
 from benchmarks.records.simulated import Records, Run, four_storeys
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles

@@ -12,7 +12,7 @@ from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.laboratory.stepped_tests import frame, spoiled
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.whole import SteadyLines
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.fit import fit_modes

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.measurement.clocks import without_delays
+from sysid.measurement.channels import without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.modal_fit import Modes

@@ -67,6 +67,19 @@ def test_the_gradient_is_that_at_fixed_covariance(model, x, levels):
     assert np.allclose(model.gradient(p, levels).gradient, made.gradient, rtol=1e-12)
 
 
+def test_what_bends_along_a_step_is_the_second_derivative_of_the_errors(model, x, levels):
+    p, h = model.unpack(x), 1e-6
+    step = 0.1 * np.random.default_rng(7).standard_normal(x.size)
+    (chunk,) = model.chunks(p)
+    run = chunk.run._replace(base=chunk.weighed(levels).base)
+    at = lambda moved, run=chunk.run: Chunk(model, model.unpack(moved), run).error  # noqa: E731
+    J = np.array([(at(x - h * e, run) - at(x + h * e, run)) / (2 * h) for e in np.eye(x.size)])
+    k = 0.01  # differences of fourth order
+    bend = sum(c * at(model.moved(x, t * k * step)) for t, c in zip(range(-2, 3), [-1, 16, -30, 16, -1], strict=True))
+    bent = np.einsum("pil,lij,jl->p", J.conj(), inverse(chunk, levels), bend / (12 * k**2), optimize=True).real
+    assert np.allclose(model.bent(levels, p, x, step, share=1e-3), bent, rtol=1e-4, atol=1e-4 * np.abs(bent).max())
+
+
 def test_a_fit_that_begins_with_some_lines_ends_as_that_of_all():
     rng = np.random.default_rng(6)
     K = np.array([[5e3, -2e3, -3e3], [-2e3, 4e3, -2e3], [-3e3, -2e3, 5e3]])

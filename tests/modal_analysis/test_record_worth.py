@@ -88,6 +88,13 @@ def test_the_mode_that_is_missing_is_the_worthiest_peak(fit_of_two):
         assert all(distance > 2 * one.ratio for distance in apart)
 
 
+def test_peaks_are_asked_for_between_two_frequencies(fit_of_two):
+    fit, missing = fit_of_two
+    low, high = 0.8 * missing, 0.95 * missing  # beside the worthiest
+    peaks = peaks_of(fit, least_worth(fit.model), within=(low, high))
+    assert peaks and all(low <= one.omega <= high for one in peaks)
+
+
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
     fit, _ = fit_of_two
     model, p, unit = fit.model, fit.parameters, units_of(fit.normal)

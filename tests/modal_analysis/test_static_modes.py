@@ -11,10 +11,10 @@ from benchmarks.band.structures import structure as continuous_structure
 from benchmarks.records.simulated import Modes as SimulatedModes
 from benchmarks.records.simulated import Run, random_motion, with_noise
 from sysid.modal_analysis.modal_estimate import residual_of
-from sysid.modal_analysis.model_order import with_static_modes
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter_over_blocks
 from sysid.modal_analysis.spectra_modes import ModeFit
+from sysid.modal_analysis.static_modes import with_static_modes
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.nlp import IterationMonitor
 from sysid.structure.structure import Structure

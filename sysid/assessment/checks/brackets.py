@@ -23,7 +23,7 @@ from sysid.assessment.checks.gains import GainErrors, gain_errors, less
 from sysid.assessment.sensitivity import KNOWN, largest_deviations, left_by_constraints, rows_of
 from sysid.errors import InputError, listed
 from sysid.finding import Finding
-from sysid.measurement.gains import tolerance_of
+from sysid.measurement.channels import tolerance_of
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import Record, noise_records
 from sysid.modal_analysis.modal_estimate import independent_rows, index_of, matched
@@ -187,8 +187,9 @@ def misfit_of_model(problem: Prepared, structure: Structure, x: Array) -> tuple[
         errors = gain_errors(modal, structure)
     else:
         std = std * _shared(noise_records(modal.records, structure, x.size)[0], modal.records, x.size)
+    known = std[:, 0] > 0  # scatter of fewer stretches than rows is none along some
     left, softness, mended, beside = (
-        part / std for part in (rows.residuals[:, None], softness, mended, np.hstack([beside, J @ free]))
+        part[known] / std[known] for part in (rows.residuals[:, None], softness, mended, np.hstack([beside, J @ free]))
     )
     there = (left[:, 0] != 0) | np.any(beside != 0, axis=1)  # runs of other lengths have no records at some lines
     found = Misfit(left[there, 0], softness[there], mended[there], beside[there], np.zeros((np.sum(there), 0)))

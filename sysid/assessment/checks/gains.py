@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import BEYOND, Context, of_tests
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
-from sysid.measurement.gains import seen_at_sensors
+from sysid.measurement.channels import seen_at_sensors
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit

@@ -18,7 +18,7 @@ from sysid.assessment.checks.context import BEYOND, Context, of_tests
 from sysid.assessment.checks.gains import distinct_poles, errors_along, tolerated_errors
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
-from sysid.measurement.gains import without_constants
+from sysid.measurement.channels import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.vector_fitting import find_poles

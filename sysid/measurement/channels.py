@@ -1,4 +1,4 @@
-"""Gains of sensors, base and force: tolerances that are stated, and records without errors that were found."""
+"""Gains and delays of channels: tolerances of gains that are stated, and records without errors that were found."""
 
 from __future__ import annotations
 
@@ -70,3 +70,14 @@ def without_gains(test: Measurement, errors: Array) -> Measurement:
 def without_constants(test: Measurement, errors: Array) -> Measurement:
     """The test without the share of the base's motion that errors of its sensors' gains, (n_sensors,), add to it."""
     return replace(test, response=test.response - errors[:, None] * (test.rigid_body @ test.base))
+
+
+def without_delays(test: Measurement, delays: Array) -> Measurement:
+    """The test with each channel earlier by its delay, s: of the sensors, then, where there is one, of the force.
+
+    Spectra of whole records are turned about: a record that begins earlier holds its beginning at its end. `taken` of
+    its `WholeRecords` says so, and their model has the samples there for unknowns.
+    """
+    turn = np.exp(2j * np.pi * delays[:, None] * test.freq)
+    force, whole = (None if test.force is None else test.force * turn[-1]), test.whole and test.whole.earlier(delays)
+    return replace(test, response=test.response * turn[: test.n_sensors], force=force, whole=whole)

@@ -1,0 +1,52 @@
+"""Damped Gauss-Newton steps beside problems whose end is known."""
+
+import numpy as np
+import pytest
+
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise
+from sysid.modal_analysis.modal_model import NormalEquations
+
+STEEP = 1e3  # of the walls of the valley
+
+
+def errors(x):
+    """Of H. H. Rosenbrock's valley (Computer J. 3 (1960) 175-184), with steeper walls; its end is (1, 1)."""
+    return np.array([STEEP * (x[1] - x[0] ** 2), 1 - x[0]])
+
+
+def slopes(x):
+    """Minus the derivative of the errors, (2, 2)."""
+    return np.array([[2 * STEEP * x[0], -STEEP], [1.0, 0.0]])
+
+
+def valley(*, bent):
+    """The problem from (-1, 1), with or without the bend of its errors, which is exact."""
+
+    def equations(x):
+        J, e = slopes(x), errors(x)
+        return NormalEquations(J.T @ J, J.T @ e, float(e @ e))
+
+    def bend(x, _, step):
+        return slopes(x).T @ np.array([-2 * STEEP * step[0] ** 2, 0.0])
+
+    return SumOfSquares(
+        np.array([-1.0, 1.0]), lambda x: x, lambda x: float(errors(x) @ errors(x)), equations,
+        bent=bend if bent else None,
+    )  # fmt: skip
+
+
+def steps_of(problem):
+    """Where it ends, and steps until there."""
+    counts = []
+    x, chi2, settled = minimise(problem, lambda i, *_: bool(counts.append(i)), 2000, lambda _: 1e-16)
+    assert settled and chi2 < 1e-12
+    return x, len(counts)
+
+
+def test_a_curved_valley_is_followed_to_its_end():
+    x, _ = steps_of(valley(bent=True))
+    assert x == pytest.approx([1.0, 1.0], abs=1e-5)
+
+
+def test_bent_steps_are_fewer():
+    assert 2 * steps_of(valley(bent=True))[1] < steps_of(valley(bent=False))[1]
