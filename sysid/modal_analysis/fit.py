@@ -319,7 +319,7 @@ def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None
         fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
         fewer = min(fit.model.unknowns - beside.model.unknowns, 0)  # further modes may go, and add no likelihood
         worse = fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood
-        if worse or leads_to(beside, without(fit, least_of(fit)).modes):
+        if worse or (fit.model.m > beside.model.m and leads_to(beside, without(fit, least_of(fit)).modes)):
             return beside
     fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
     monitor.keep(fit)

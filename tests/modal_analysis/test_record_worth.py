@@ -1,5 +1,7 @@
 """Judgement of modes of whole records, by products of many at once, against plain loops and matrices written out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import least_worth, peaks_of, pruned, trials_of, without_weak_modes
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
+from sysid.modal_analysis.rough_poles import leads_to
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths
@@ -93,6 +96,19 @@ def test_peaks_are_asked_for_between_two_frequencies(fit_of_two):
     low, high = 0.8 * missing, 0.95 * missing  # beside the worthiest
     peaks = peaks_of(fit, least_worth(fit.model), within=(low, high))
     assert peaks and all(low <= one.omega <= high for one in peaks)
+
+
+def test_modes_lead_to_the_end_of_a_fit_that_has_them_within_the_lines(fit_of_two):
+    fit, missing = fit_of_two
+    modes, last = fit.parameters.modes, 2 * np.pi * fit.test.freq[-1]
+    assert leads_to(fit, modes)
+    assert not leads_to(fit, modes.at([0]))
+    assert not leads_to(fit, modes._replace(omega=np.array([modes.omega[0], missing])))
+    assert not leads_to(replace(fit, settled=False), modes)
+    above = replace(fit, parameters=fit.parameters.with_modes(
+        modes._replace(omega=np.array([modes.omega[0], 1.2 * last])), fit.parameters.ends
+    ))  # fmt: skip
+    assert leads_to(above, modes._replace(omega=np.array([modes.omega[0], 1.5 * last])))
 
 
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
