@@ -9,6 +9,7 @@ import pytest
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, LumpedMass, Problem, Sensor, Structure, simulate
+from sysid.assessment.checks import brackets
 from sysid.assessment.checks.brackets import Misfit, beside_rigid, softest
 
 pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
@@ -119,6 +120,23 @@ class TestStatedMass:
         stated = {"mass": truth.mass[:4, :4], "stiffness": sysid.ChainStiffness(1e5, 1e6)}
         result = sysid.identify(Problem(test, **stated), rng=0)
         assert [channel for channel, *_ in told(result)] == ["sensor 3"]
+
+    def test_rows_without_any_scatter_are_left_out(self, monkeypatch):
+        """Few stretches of records that squares took tell none along some."""
+        seen, plain = [], brackets.stacked_rows
+
+        def without_scatter(rows):
+            every = plain(rows)
+            return dataclasses.replace(every, std=np.where(np.arange(every.std.size) % 5 == 0, 0.0, every.std))
+
+        def noted(misfit, top):
+            seen.append(misfit)
+            return softest(misfit, top)
+
+        monkeypatch.setattr(brackets, "stacked_rows", without_scatter)
+        monkeypatch.setattr(brackets, "softest", noted)
+        assert not told(sysid.identify(Problem(shaken(storeys()), mass=LumpedMass()), rng=0))
+        assert seen and all(np.all(np.isfinite(part)) for misfit in seen for part in misfit)
 
     def test_names_none_beside_a_free_mass_which_takes_it_up(self):
         test = on_bracket(shaken(storeys()), 2, 3 * storeys().natural_frequencies[-1])
