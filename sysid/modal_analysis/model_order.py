@@ -55,8 +55,6 @@ def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement
         beside_all = fit.static and fit.parameters.coupling is None  # poles above the lines came with static modes
         most = 2 * np.pi * fit.test.freq[-1] if beside_all else np.inf
         peaks = peaks_of(fit, least_worth(fit.model), within=(0.0, most))[: fit.model.m]
-        if not peaks:
-            return fit
         more = _with_peaks(fit, peaks, some, monitor)
         if more is None and len(peaks) > 1:
             more = _with_peaks(fit, peaks[:1], some, monitor)

@@ -356,15 +356,15 @@ def _minimise(
         nonlocal before
         monitor(done + i, float(np.sqrt(2 * chi2 / model.numbers)))
         creeps, before = model.static > 0 and before - chi2 < creeping, chi2
-        return creeps and equations.promised_in_lines(at, levels) < 10 * _SETTLED
+        return creeps and equations.still_in_lines(at, levels)
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
         lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
-        (lambda *of_step: model.bent(levels, *of_step)) if model.static else None,
+        (lambda at, x, step: model.bent(at, levels, x, step)) if model.static else None,
     )  # fmt: skip
     p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
-    return p, chi2, ended or (model.static > 0 and equations.promised_in_lines(p, levels) < 10 * _SETTLED)
+    return p, chi2, ended or (model.static > 0 and equations.still_in_lines(p, levels))
 
 
 class _Equations:
@@ -393,9 +393,9 @@ class _Equations:
             equations = self.model.gradient(p, levels)
         return equations._replace(normal=self.normal)
 
-    def promised_in_lines(self, p: Parameters, levels: Array) -> float:
-        """Fall of the sum of squares that a step promises where modes above the lines stay as they are."""
-        equations, model = self(p, levels), self.model
+    def still_in_lines(self, p: Parameters, levels: Array) -> bool:
+        """True where a step promises no fall of the sum of squares while modes above the lines stay as they are."""
+        here, model = self(p, levels), self.model
         index, stays = model.index, model.of_others(p)
         held = np.zeros(model.size, bool)
         held[index.phi] = np.tile(stays, model.n)
@@ -403,8 +403,8 @@ class _Equations:
         held[index.log_omega] = held[index.log_ratios] = stays
         held[model.kept : model.kept + model.n_ends] = np.repeat(stays, model.n_ends // model.m)
         held[model.coupling] = np.any(stays[model.coupled], axis=1)
-        normal, size = unit_diagonal(equations.normal[np.ix_(~held, ~held)])
-        return float(np.sum((half_inverse(normal, ROUND_OFF).T @ (equations.gradient[~held] / size)) ** 2))
+        normal, size = unit_diagonal(here.normal[np.ix_(~held, ~held)])
+        return bool(np.sum((half_inverse(normal, ROUND_OFF).T @ (here.gradient[~held] / size)) ** 2) < 10 * _SETTLED)
 
     def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
         """The same with the matrix of these very parameters; None where it was."""

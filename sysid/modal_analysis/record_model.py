@@ -235,7 +235,7 @@ class RecordModel(SpectralModel):
         """The same without the normal matrix, which stays zero: several times as fast."""
         return self._products(p, levels, lambda chunk, *given: chunk.sums_of_errors(*given))
 
-    def bent(self, levels: Array, p: Parameters, x: Array, step: Array, share: float = 0.1) -> Array:
+    def bent(self, p: Parameters, levels: Array, x: Array, step: Array, share: float = 0.1) -> Array:
         """``Re J' S^-1 e''``, e'' the second derivative of errors along a step, by differences over a share of it."""
         back, ahead = (self.unpack(self.moved(x, times * step)) for times in (-share, share))
 

@@ -76,8 +76,8 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         m, modes = fit.model.m, fit.parameters.modes
         price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
         above = np.count_nonzero(modes.omega > last) - fit.static
-        peaks = peaks_of(fit, price, within=near)
-        if not peaks or above > max(fit.test.n_base, 2):  # as many as of spectra
+        # As many as of spectra.
+        if above > max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, price, within=near)):
             return fit
         more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, monitor=monitor)
         if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley

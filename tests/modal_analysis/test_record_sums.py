@@ -77,7 +77,7 @@ def test_what_bends_along_a_step_is_the_second_derivative_of_the_errors(model, x
     k = 0.01  # differences of fourth order
     bend = sum(c * at(model.moved(x, t * k * step)) for t, c in zip(range(-2, 3), [-1, 16, -30, 16, -1], strict=True))
     bent = np.einsum("pil,lij,jl->p", J.conj(), inverse(chunk, levels), bend / (12 * k**2), optimize=True).real
-    assert np.allclose(model.bent(levels, p, x, step, share=1e-3), bent, rtol=1e-4, atol=1e-4 * np.abs(bent).max())
+    assert np.allclose(model.bent(p, levels, x, step, share=1e-3), bent, rtol=1e-4, atol=1e-4 * np.abs(bent).max())
 
 
 def test_a_fit_that_begins_with_some_lines_ends_as_that_of_all():
