@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,12 +37,12 @@ print(time.process_time() - begun)
 def lines(reduced: bool) -> Iterator[Line]:
     """Seconds of a run, then processor seconds on one thread: the least of some, of imports the median.
 
-    The reduced form leaves out the page of 40 sensors, and judges the seconds of the import at the speed of a machine
-    that does nothing else.
+    The reduced form leaves out the page of 40 sensors, and judges seconds at the speed of a machine that does nothing
+    else: each at that of its own moment, as it changes by a third within seconds.
     """
     with tempfile.TemporaryDirectory() as name, threadpool_limits(limits=1):
         folder = Path(name)
-        yield _of_a_run(folder, reduced)
+        yield from _of_a_run(folder, reduced)
         page = sysid.write_report(answer(20, 1000, force=True), folder / "large")
         yield below("bytes of the page of 20 sensors, 3 directions, 1,000 lines", page.stat().st_size, MOST_BYTES)
         if not reduced:
@@ -52,23 +52,39 @@ def lines(reduced: bool) -> Iterator[Line]:
             yield below(text, min(taken), MOST_SECONDS)
             yield below("its bytes", (folder / "larger.html").stat().st_size, MOST_OF_FORTY)
         # one of many: without a force, whose matrices have 840 ends
-        taken = [_seconds(answer(20, 500, force=False).summary) for _ in range(2 if reduced else 3)]
-        yield below("first summary of 20 sensors without a force, processor s", min(taken), AT_ONCE)
+        taken, beside = [], list[float]()
+        for _ in range(3):
+            taken.append(_seconds(answer(20, 500, force=False).summary))
+            beside.append(fixed_work(1))
+        text = "first summary of 20 sensors without a force, processor s: least"
+        yield from _judged(text, min, taken, beside if reduced else [], AT_ONCE)
         yield from _of_imports(folder, reduced)
 
 
-def _of_a_run(folder: Path, reduced: bool) -> Line:
+def _judged(
+    text: str, of: Callable[[Sequence[float]], float], taken: list[float], beside: list[float], most: float
+) -> Iterator[Line]:
+    """The line of these seconds, and of those at full speed, by fixed work beside each, which then is judged."""
+    if beside:
+        yield Line(text, f"{of(taken):.3g}")
+        full = [at_full_speed(one, other)[1] for one, other in zip(taken, beside, strict=True)]
+        text, taken = f"the same {at_full_speed(0.0, statistics.median(beside))[0]}", full
+    yield below(text, of(taken), most)
+
+
+def _of_a_run(folder: Path, reduced: bool) -> Iterator[Line]:
     """Seconds of the first command, whose page has pictures."""
     command = [sys.executable, "-m", "sysid", "run", "cantilever_tower", "--quiet", "--out", str(folder / "tower")]
-    seconds = []
+    seconds, beside = [], []
     for run in range(4):
         begun = time.perf_counter()
         subprocess.run(command, check=True, cwd=folder)
         seconds.append(time.perf_counter() - begun)
+        beside.append(fixed_work(1))
         if reduced and run and seconds[-1] < MOST_OF_A_RUN:  # else other work may have had the processor
             break
     text = "sysid run cantilever_tower with its page, not the first time, s: least"
-    return below(text, min(seconds[1:]), MOST_OF_A_RUN)
+    yield from _judged(text, min, seconds[1:], beside[1:] if reduced else [], MOST_OF_A_RUN)
 
 
 def _of_imports(folder: Path, reduced: bool) -> Iterator[Line]:
@@ -76,14 +92,7 @@ def _of_imports(folder: Path, reduced: bool) -> Iterator[Line]:
     count = 5 if reduced else 15
     text = f"import of sysid beyond NumPy and CasADi, median of {count} processes with compiled files, processor s"
     taken, beside = _import_seconds(folder, count)
-    seconds = statistics.median(taken)
-    if reduced:
-        yield Line(text, f"{seconds:.3g}")
-        # The machine's speed changes by a third within seconds: each process is judged at that of its own moment.
-        pairs = zip(taken, beside, strict=True)
-        seconds = statistics.median(at_full_speed(one, other)[1] for one, other in pairs)
-        text = f"the same {at_full_speed(seconds, statistics.median(beside))[0]}"
-    yield below(text, seconds, IMPORT)
+    yield from _judged(text, statistics.median, taken, beside if reduced else [], IMPORT)
 
 
 def _import_seconds(folder: Path, count: int) -> tuple[list[float], list[float]]:

@@ -322,7 +322,8 @@ def changes_of_matrices(
         (squared, 2 * squared[:, None] * moves.log_omega, False),
         (loss, loss[:, None] * (moves.log_omega + moves.log_ratios), bool(np.any(coupling))),
     ):
-        inner = change[:, None] / 2 * P[:, :, None] - diagonal[:, None, None] * moved
+        inner = change[:, None] / 2 * P[:, :, None]
+        inner -= diagonal[:, None, None] * moved
         if others:
             inner += np.einsum("klc,lj->kjc", coupled / 2, P) - np.einsum("kl,ljc->kjc", coupling, moved)
         half = (P.T @ inner.reshape(len(P), -1)).reshape(inner.shape)

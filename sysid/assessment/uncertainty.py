@@ -243,11 +243,12 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: G
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     shifts = shifts[:, : possible.size]
     mine = modes.at(own)
-    changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
-    matrices = [moves.std(change, size) for change, size in changes]
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = [open_, open_, open_]  # zeros that a decoupled structure keeps included
+    else:
+        changes = changes_of_matrices(structure, mine, moves.of(own), coupling, coupled)
+        matrices = [moves.std(change, size) for change, size in changes]
     by_gains = Perturbations(0, *index.split(shifts))
     mass_by_gain, _ = next(changes_of_matrices(structure, mine, by_gains.of(own), coupling, coupled))
     by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))
