@@ -18,7 +18,7 @@ from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.direct_terms import without_window
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
-from sysid.modal_analysis.misfit import deviations, left_of, without_transients
+from sysid.modal_analysis.misfit import deviations, left_of, misses_much, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.model_order import (
     least_of,
@@ -41,6 +41,7 @@ from sysid.modal_analysis.record_fit import (
 )
 from sysid.modal_analysis.residual_tests import (
     calibration_of,
+    delays_beside_dampers,
     delays_left,
     delays_of,
     excess_of,
@@ -55,11 +56,13 @@ from sysid.modal_analysis.residual_tests import (
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.rough_poles import (
     at_few_lines,
-    at_sines_alone,
+    at_some_lines,
     decimated_lines,
     leads_to,
+    refuse_sines,
     rough_deviations,
     same_modes,
+    shadows_of,
     steady_sine,
 )
 from sysid.modal_analysis.spectra_modes import strongest_poles
@@ -98,14 +101,14 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
         best = monitor.best
         if not isinstance(best, RecordFit):
             raise
-    _refuse_sines(best, test)
+    refuse_sines(best, test)
     if best.model.whole.taken is not None:
         test = without_delays(test, best.model.whole.taken)
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
 
 
-def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.1, worse: float = 1.01) -> RecordFit:
+def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, worse: float = 1.01) -> RecordFit:
     """The fit; where its model misses much of the records, and more than least squares of them do, these.
 
     What a model misses passes for noise of the base, by which the modes then explain anything. Least squares go on from
@@ -114,7 +117,7 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, much: float = 0.
     base moves at few lines, as in a sine, squares would be those of these lines alone.
     """
     left, whole = left_of(fit), fit.model.whole
-    sound = fit.stopped or whole.noise is not None or left < much or at_few_lines(fit.test)
+    sound = fit.stopped or whole.noise is not None or not misses_much(left) or at_few_lines(fit.test)
     if sound or (left < 1.0 and not uneven(fit, but=0.03)):  # a tone or a spike is no wrong model
         return fit
     monitor.doing = "least squares"
@@ -151,9 +154,8 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
         if (below and several) or np.max(np.abs(gain.certain)) > 3 * std or worth <= fit.schwarz:
             return fit
         right = without_constants(replace(free.test, gain_std=test.gain_std), gain.certain)
-        lines = decimated_lines(test)
-        some, p = None if np.all(lines) else right.at(lines), replace(free.parameters, gains=np.zeros(0))
-        more = refitted(replace(free, test=right), p, some=some, monitor=monitor)
+        p = replace(free.parameters, gains=np.zeros(0))
+        more = refitted(replace(free, test=right), p, some=at_some_lines(right), monitor=monitor)
         likelier = more.settled and more.schwarz - price > fit.schwarz
         likelier &= not np.any(more.parameters.modes.omega < 2 * np.pi * test.freq[0])
     except (Stop, KeyboardInterrupt):
@@ -172,13 +174,6 @@ def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
     kept = strongest_poles(Records(fit.test), poles, fit.model.m, np.ones(poles.omega.size, bool))
     anew = record_modes(fit.test, poles.omega[kept], poles.ratios[kept], monitor=monitor)
     return [refitted(anew, anew.parameters, monitor=monitor)]
-
-
-def _refuse_sines(fit: RecordFit, test: Measurement) -> None:
-    """Refuse modes of records of a steady sine where no other line shows them."""
-    sentence, modes = steady_sine(test), fit.parameters.modes
-    if sentence is not None and (not fit.settled or at_sines_alone(test, modes.omega, modes.ratios)):
-        raise InputError(sentence)
 
 
 def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, rounds: int = 4) -> RecordFit:
@@ -219,25 +214,29 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
 def _first_delays(
     test: Measurement, delays: Array, monitor: FitMonitor, times: float = 25.0
 ) -> tuple[Array, RecordFit | None]:  # fmt: skip
-    """Delays, s, with those that the first modes show by `times` their price, and these modes where they are none.
+    """Delays, s, with those that the first modes show by `times` their price, and these modes without them, if any.
 
-    Modes that are still missing may look like small ones, which are left to the fit of all modes.
+    Modes that are still missing may look like small ones, which are left to the fit of all modes; late channels look
+    like weak modes beside strong ones.
     """
-    lines = decimated_lines(test)
-    some = without_delays(test if np.all(lines) else test.at(lines), delays)
+    some = without_delays(test.at(decimated_lines(test)), delays)
     try:
         first = _fitted(_rough_fit(some, monitor), monitor)
     except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
         return delays, None
-    p, none = first.parameters, np.zeros((first.model.m,) * 2)  # couplings turn residues too: late is what they do not
-    marginal, left = delays_left(replace(first, parameters=replace(p, coupling=none))), delays_left(first)
-    if first.model.whole.grows or marginal is None or not np.any((delays + marginal != 0) & (delays == 0)):
-        return delays, first
-    left = marginal if left is None or np.any((left != 0) != (marginal != 0)) else left
-    total, monitor.doing = delays + left, "delays"
-    trial = on_turned(first, without_delays(some, left), monitor=monitor)
-    late = trial.schwarz - first.schwarz >= times * _price(total, delays, first)
-    return (total, None) if late else (delays, first)
+    monitor.doing, shadows = "delays", shadows_of(first.parameters.modes)
+    alone = [refitted(first, without(first, shadows), monitor=monitor)] if np.any(shadows) else []
+    for one in (first, *alone):
+        left = delays_beside_dampers(one)
+        if np.any((left != 0) & (delays == 0)):
+            trial = on_turned(one, without_delays(some, left), monitor=monitor)
+            if trial.schwarz - first.schwarz >= times * _price(delays + left, delays, first):
+                return _first_delays(test, delays + left + delays_beside_dampers(trial) * (left != 0), monitor)
+    left = delays_beside_dampers(first) * (delays != 0)  # further modes would stand for what is left of them
+    if np.any(left):
+        trial = on_turned(first, without_delays(some, left), monitor=monitor)
+        return (delays + left, trial) if trial.schwarz > first.schwarz else (delays, first)
+    return delays, first
 
 
 def _price(total: Array, delays: Array, fit: RecordFit) -> float:
@@ -254,7 +253,7 @@ def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         if sentence is None:
             raise
         raise InputError(sentence) from error
-    _refuse_sines(fit, test)
+    refuse_sines(fit, test)
     monitor.doing = "levels of noise that vary"  # where the level was too low, noise passed for modes
     return without_weak_modes(with_varying_levels(fit, monitor=monitor), monitor)
 
@@ -265,9 +264,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
     Poles are looked for twice: with rough weights, and with the noise that a first fit found, where it is not given;
     where lines are many, on some of them, from which the fit of all begins.
     """
-    lines = decimated_lines(test)
-    if not np.all(lines):
-        some = test.at(lines)
+    if (some := at_some_lines(test)) is not None:
         fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
         fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
@@ -294,7 +291,7 @@ def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordF
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     """The fit with couplings, then further modes that are worth it, without spurious ones."""
-    some = None if np.all(lines := decimated_lines(fit.test)) else fit.test.at(lines)
+    some = at_some_lines(fit.test)
     fit = with_couplings(fit, lambda rough: pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
     monitor.keep(fit)
     if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
@@ -304,7 +301,9 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     monitor.doing = "spurious modes"
     fit = without_spurious_modes(fit, some=some, monitor=monitor)
     monitor.keep_instead(fit)
-    return fit
+    # A pole for all modes above the lines may be no mode, and what they add then passes for noise of the base.
+    above = with_static_modes(fit, monitor=monitor) if misses_much(left_of(fit)) else fit
+    return fit if above is fit else _with_all_modes(above, monitor)
 
 
 def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:

@@ -167,6 +167,11 @@ def left_of(fit: RecordFit) -> float:
     return float(np.sqrt(left / size)) if size else 0.0
 
 
+def misses_much(left: float, much: float = 0.1) -> bool:
+    """True of what `left_of` says where the model may be wrong, and not the noise large."""
+    return left >= much
+
+
 def without_transients(fit: RecordFit) -> Measurement:
     """The records as they would be at rest at both ends, were there no laws of amplitude; with their noise stated."""
     test, model, p = fit.test, fit.model, fit.parameters

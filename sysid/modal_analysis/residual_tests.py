@@ -436,6 +436,15 @@ def delays_left(fit: RecordFit, near: float = 0.3, *, missed: float = _MISSED) -
     return late @ more if np.any(np.abs(more) > near * np.sqrt(np.diag(covariance))) else None
 
 
+def delays_beside_dampers(fit: RecordFit) -> Array:
+    """Those that show beside any dampers between the modes too, which turn residues as they do, s; zero for none."""
+    found, none = delays_left(fit), np.zeros((fit.model.m, fit.model.m))
+    marginal = delays_left(replace(fit, parameters=replace(fit.parameters, coupling=none)))
+    if fit.model.whole.grows or marginal is None:
+        return np.zeros(fit.asked.size - fit.asked.delays)
+    return marginal if found is None or np.any((found != 0) != (marginal != 0)) else found
+
+
 def delays_of(fit: RecordFit) -> Delays:
     """Delays that were taken off the records of a fit, with their errors at its end."""
     late, of_base = _taken(fit)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import refuse
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import RecordFit
@@ -35,6 +35,12 @@ def decimated_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -
         at = np.floor(np.cumsum(np.minimum(step, 1.0)))
         keep[lines[np.append(np.flatnonzero(np.diff(at, prepend=-1.0) > 0), -1)]] = True
     return keep if 2 * np.count_nonzero(keep) < keep.size else np.ones_like(keep)
+
+
+def at_some_lines(test: Measurement) -> Measurement | None:
+    """The test at `decimated_lines`; None where these are all."""
+    keep = decimated_lines(test)
+    return None if np.all(keep) else test.at(keep)
 
 
 def rough_deviations(test: Measurement) -> Array:
@@ -85,6 +91,13 @@ def at_sines_alone(test: Measurement, omega: Array, ratios: Array) -> bool:
     spacing = np.max(np.diff(test.freq))
     inside = (f > test.freq[0]) & (f < test.freq[-1])
     return not np.any(inside & np.all([np.abs(f - sine) > _BESIDE * spacing for sine in found], axis=0))
+
+
+def refuse_sines(fit: RecordFit, test: Measurement) -> None:
+    """Refuse modes of records of a steady sine where no other line shows them."""
+    sentence, modes = steady_sine(test), fit.parameters.modes
+    if sentence is not None and (not fit.settled or at_sines_alone(test, modes.omega, modes.ratios)):
+        raise InputError(sentence)
 
 
 def _sines(test: Measurement, share: float = 0.9, few: float = 0.1) -> list[float] | None:
@@ -138,3 +151,13 @@ def leads_to(fit: RecordFit, modes: Modes) -> bool:
     last = 2 * np.pi * fit.test.freq[-1]
     inside = (one.at(one.omega <= last) for one in (fit.parameters.modes, modes))
     return fit.settled and fit.model.m == modes.omega.size and same_modes(*inside)
+
+
+def shadows_of(modes: Modes, weak: float = 0.1) -> NDArray[np.bool_]:
+    """Modes within half the half-power width of one that the base drives ten times as much, or by another `weak`, (m,).
+
+    A channel that is late answers as if beside each mode there were such a one.
+    """
+    f, size = modes.omega, np.linalg.norm(modes.gamma, axis=1)
+    near = np.abs(f - f[:, None]) < np.minimum(modes.ratios * f, (modes.ratios * f)[:, None])
+    return np.any(near & (size[:, None] < weak * size), axis=1)
