@@ -211,32 +211,38 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
         return replace(fit, stopped=True)
 
 
-def _first_delays(
-    test: Measurement, delays: Array, monitor: FitMonitor, times: float = 25.0
-) -> tuple[Array, RecordFit | None]:  # fmt: skip
-    """Delays, s, with those that the first modes show by `times` their price, and these modes without them, if any.
+def _first_delays(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[Array, RecordFit | None]:
+    """Delays, s, with those that the first modes show, and these modes without them, if any.
 
     Modes that are still missing may look like small ones, which are left to the fit of all modes; late channels look
-    like weak modes beside strong ones.
+    like weak modes beside strong ones, and further modes would stand for what is left of them.
     """
     some = without_delays(test.at(decimated_lines(test)), delays)
     try:
         first = _fitted(_rough_fit(some, monitor), monitor)
+        if not np.any(late := _newly_late(first, delays, monitor, 25.0)):
+            first = _by_the_noise_found(first, monitor)
+            late = _newly_late(first, delays, monitor, 5.0)
     except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
         return delays, None
-    monitor.doing, shadows = "delays", shadows_of(first.parameters.modes)
-    alone = [refitted(first, without(first, shadows), monitor=monitor)] if np.any(shadows) else []
-    for one in (first, *alone):
+    if np.any(late):
+        return _first_delays(test, delays + late, monitor)
+    left = delays_beside_dampers(first) * (delays != 0)
+    trial = on_turned(first, without_delays(some, left), monitor=monitor) if np.any(left) else first
+    return (delays + left, trial) if trial.schwarz > first.schwarz else (delays, first)
+
+
+def _newly_late(fit: RecordFit, delays: Array, monitor: FitMonitor, times: float) -> Array:
+    """What is left of delays, s, where a fit shows some of channels without any by `times` their price; else zeros."""
+    monitor.doing, shadows = "delays", shadows_of(fit.parameters.modes)
+    alone = [refitted(fit, without(fit, shadows), monitor=monitor)] if np.any(shadows) else []
+    for one in (fit, *alone):
         left = delays_beside_dampers(one)
         if np.any((left != 0) & (delays == 0)):
-            trial = on_turned(one, without_delays(some, left), monitor=monitor)
-            if trial.schwarz - first.schwarz >= times * _price(delays + left, delays, first):
-                return _first_delays(test, delays + left + delays_beside_dampers(trial) * (left != 0), monitor)
-    left = delays_beside_dampers(first) * (delays != 0)  # further modes would stand for what is left of them
-    if np.any(left):
-        trial = on_turned(first, without_delays(some, left), monitor=monitor)
-        return (delays + left, trial) if trial.schwarz > first.schwarz else (delays, first)
-    return delays, first
+            trial = on_turned(one, without_delays(fit.test, left), monitor=monitor)
+            if trial.schwarz - fit.schwarz >= times * _price(delays + left, delays, fit):
+                return np.asarray(left + delays_beside_dampers(trial) * (left != 0))
+    return np.zeros(delays.size)
 
 
 def _price(total: Array, delays: Array, fit: RecordFit) -> float:
@@ -270,12 +276,18 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
         monitor.keep(fit)
         return _with_all_modes(fit, monitor)  # weak ones show on all lines only
-    fit = _fitted(_rough_fit(test, monitor), monitor) if first is None else first
-    monitor.doing = "poles by the noise found"
+    if first is None:
+        first = _by_the_noise_found(_fitted(_rough_fit(test, monitor), monitor), monitor)
+    return _with_all_modes(first, monitor)
+
+
+def _by_the_noise_found(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
+    """The fit, or that of poles looked for once more, by its noise, where it is better."""
+    monitor.doing, test = "poles by the noise found", fit.test
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
-    if not same_modes(fit.parameters.modes, again):
-        fit = max(fit, _fitted(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
-    return _with_all_modes(fit, monitor)
+    if same_modes(fit.parameters.modes, again):
+        return fit
+    return max(fit, _fitted(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
 
 
 def _rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
