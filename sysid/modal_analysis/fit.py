@@ -16,12 +16,12 @@ from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.direct_terms import without_window
+from sysid.modal_analysis.first_modes import by_the_noise_found, first_modes, price_of_delays, rough_fit, settled_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
-from sysid.modal_analysis.misfit import deviations, left_of, misses_much, without_transients
+from sysid.modal_analysis.misfit import left_of, misses_much, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.model_order import (
-    least_of,
     least_worth,
     peaks_of,
     pruned,
@@ -31,7 +31,6 @@ from sysid.modal_analysis.model_order import (
 )
 from sysid.modal_analysis.record_fit import (
     ROUGH,
-    TRIAL,
     RecordFit,
     at_all_lines,
     on_turned,
@@ -41,7 +40,6 @@ from sysid.modal_analysis.record_fit import (
 )
 from sysid.modal_analysis.residual_tests import (
     calibration_of,
-    delays_beside_dampers,
     delays_left,
     delays_of,
     excess_of,
@@ -58,16 +56,12 @@ from sysid.modal_analysis.rough_poles import (
     at_few_lines,
     at_some_lines,
     decimated_lines,
-    leads_to,
     refuse_sines,
-    rough_deviations,
-    same_modes,
-    shadows_of,
     steady_sine,
 )
 from sysid.modal_analysis.spectra_modes import strongest_poles
 from sysid.modal_analysis.static_modes import with_static_modes
-from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.nlp import one_thread
 from sysid.structure.amplitude import AmplitudeLaw
 from sysid.structure.structure import Array
@@ -182,7 +176,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     Those that the first modes show are taken off before any others are looked for, which would stand for them. Modes
     are looked for anew where a channel is newly late. Those that chance explains are put back, unless that is worse.
     """
-    delays, first = _first_delays(test, delays, monitor)
+    delays, first = first_modes(test, delays, monitor)
     fit = found = _whole_fit(without_delays(test, delays), monitor, first)
     try:
         for _ in range(rounds):
@@ -197,7 +191,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 beside = fit.static > 0 or not np.any(new)  # what stands for modes above is not looked for anew
                 trial = on_turned(fit, turned, monitor=monitor) if beside else _whole_fit(turned, monitor)
                 trial = _with_all_modes(trial, monitor) if beside and np.any(new) else trial
-                if trial.schwarz - fit.schwarz >= times * _price(total, delays, fit):
+                if trial.schwarz - fit.schwarz >= times * price_of_delays(total, delays, fit):
                     fit, delays = trial, total
                     break
             else:
@@ -205,50 +199,10 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
             fewer = on_turned(fit, without_delays(test, kept := np.where(certain, delays, 0.0)), monitor=monitor)
-            fit = fewer if fewer.schwarz + _price(delays, kept, fit) > fit.schwarz else fit
+            fit = fewer if fewer.schwarz + price_of_delays(delays, kept, fit) > fit.schwarz else fit
         return fit if fit is found else without_weak_modes(fit, monitor)  # which was done there
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
-
-
-def _first_delays(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[Array, RecordFit | None]:
-    """Delays, s, with those that the first modes show, and these modes without them, if any.
-
-    Modes that are still missing may look like small ones, which are left to the fit of all modes; late channels look
-    like weak modes beside strong ones, and further modes would stand for what is left of them.
-    """
-    some = without_delays(test.at(decimated_lines(test)), delays)
-    try:
-        first = _fitted(_rough_fit(some, monitor), monitor)
-        if not np.any(late := _newly_late(first, delays, monitor, 25.0)):
-            first = _by_the_noise_found(first, monitor)
-            late = _newly_late(first, delays, monitor, 5.0)
-    except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
-        return delays, None
-    if np.any(late):
-        return _first_delays(test, delays + late, monitor)
-    left = delays_beside_dampers(first) * (delays != 0)
-    trial = on_turned(first, without_delays(some, left), monitor=monitor) if np.any(left) else first
-    return (delays + left, trial) if trial.schwarz > first.schwarz else (delays, first)
-
-
-def _newly_late(fit: RecordFit, delays: Array, monitor: FitMonitor, times: float) -> Array:
-    """What is left of delays, s, where a fit shows some of channels without any by `times` their price; else zeros."""
-    monitor.doing, shadows = "delays", shadows_of(fit.parameters.modes)
-    alone = [refitted(fit, without(fit, shadows), monitor=monitor)] if np.any(shadows) else []
-    for one in (fit, *alone):
-        left = delays_beside_dampers(one)
-        if np.any((left != 0) & (delays == 0)):
-            trial = on_turned(one, without_delays(fit.test, left), monitor=monitor)
-            if trial.schwarz - fit.schwarz >= times * _price(delays + left, delays, fit):
-                return np.asarray(left + delays_beside_dampers(trial) * (left != 0))
-    return np.zeros(delays.size)
-
-
-def _price(total: Array, delays: Array, fit: RecordFit) -> float:
-    """Schwarz's price of the delays `total` in place of `delays`; equal ones are one number."""
-    more = np.unique(total[total != 0]).size - np.unique(delays[delays != 0]).size
-    return float(more * np.log(fit.model.numbers) / 2)
 
 
 def _whole_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None = None) -> RecordFit:
@@ -277,28 +231,8 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         monitor.keep(fit)
         return _with_all_modes(fit, monitor)  # weak ones show on all lines only
     if first is None:
-        first = _by_the_noise_found(_fitted(_rough_fit(test, monitor), monitor), monitor)
+        first = by_the_noise_found(settled_modes(rough_fit(test, monitor), monitor), monitor)
     return _with_all_modes(first, monitor)
-
-
-def _by_the_noise_found(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
-    """The fit, or that of poles looked for once more, by its noise, where it is better."""
-    monitor.doing, test = "poles by the noise found", fit.test
-    again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
-    if same_modes(fit.parameters.modes, again):
-        return fit
-    return max(fit, _fitted(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
-
-
-def _rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
-    monitor.doing = "poles by rough weights"
-    return _with_poles(test, find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor), monitor)
-
-
-def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
-    """One mode at each pole, roughly, without those that noise explains; further ones at a pole show in its errors."""
-    monitor.doing = f"{poles.omega.size} modes"
-    return pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
 
 
 def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
@@ -316,25 +250,6 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     # A pole for all modes above the lines may be no mode, and what they add then passes for noise of the base.
     above = with_static_modes(fit, monitor=monitor) if misses_much(left_of(fit)) else fit
     return fit if above is fit else _with_all_modes(above, monitor)
-
-
-def _fitted(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
-    """The fit, settled, without modes that noise explains.
-
-    Where a few steps lead to the modes of the fit `beside` within the lines, and to as many, it is the same: poles
-    beyond the lines, which hardly show, move until the end. Some more steps show whether others are likelier.
-    """
-    if beside is not None:
-        if beside.schwarz >= fit.schwarz and leads_to(beside, fit.parameters.modes):
-            return beside
-        fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
-        fewer = min(fit.model.unknowns - beside.model.unknowns, 0)  # further modes may go, and add no likelihood
-        worse = fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood
-        if worse or (fit.model.m > beside.model.m and leads_to(beside, without(fit, least_of(fit)).modes)):
-            return beside
-    fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
-    monitor.keep(fit)
-    return fit
 
 
 def fit_modes(
@@ -463,7 +378,7 @@ def _early_laws(
         return None
     try:
         with monitor.at_work():
-            rough = at_all_lines(_rough_fit(test.at(decimated_lines(test)), monitor), test)
+            rough = at_all_lines(rough_fit(test.at(decimated_lines(test)), monitor), test)
         if left_of(rough) < much:
             return None
         found = with_laws(rough, stated, monitor=monitor, probe=True)

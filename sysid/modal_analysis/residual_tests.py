@@ -438,10 +438,11 @@ def delays_left(fit: RecordFit, near: float = 0.3, *, missed: float = _MISSED) -
 
 def delays_beside_dampers(fit: RecordFit) -> Array:
     """Those that show beside any dampers between the modes too, which turn residues as they do, s; zero for none."""
-    found, none = delays_left(fit), np.zeros((fit.model.m, fit.model.m))
-    marginal = delays_left(replace(fit, parameters=replace(fit.parameters, coupling=none)))
-    if fit.model.whole.grows or marginal is None:
+    coupled = replace(fit.parameters, coupling=np.zeros((fit.model.m, fit.model.m)))
+    marginal = None if fit.model.whole.grows else delays_left(replace(fit, parameters=coupled))
+    if marginal is None:
         return np.zeros(fit.asked.size - fit.asked.delays)
+    found = delays_left(fit)
     return marginal if found is None or np.any((found != 0) != (marginal != 0)) else found
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import RecordFit
-from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
@@ -136,28 +135,3 @@ def poles_of_test(test: Measurement) -> tuple[Array, Array]:
         test = replace(test, response_std=rough_deviations(test))
     found = find_poles(test)
     return found.omega, found.ratios
-
-
-def same_modes(modes: Modes, poles: Poles | Modes) -> bool:
-    """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
-    if modes.omega.size != poles.omega.size:
-        return False
-    apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
-    return bool(np.all(apart.min(axis=0, initial=np.inf) < 1) and np.all(apart.min(axis=1, initial=np.inf) < 1))
-
-
-def leads_to(fit: RecordFit, modes: Modes) -> bool:
-    """True where a fit from these modes would end as this settled one: as many, and the same within the lines."""
-    last = 2 * np.pi * fit.test.freq[-1]
-    inside = (one.at(one.omega <= last) for one in (fit.parameters.modes, modes))
-    return fit.settled and fit.model.m == modes.omega.size and same_modes(*inside)
-
-
-def shadows_of(modes: Modes, weak: float = 0.1) -> NDArray[np.bool_]:
-    """Modes within half the half-power width of one that the base drives ten times as much, or by another `weak`, (m,).
-
-    A channel that is late answers as if beside each mode there were such a one.
-    """
-    f, size = modes.omega, np.linalg.norm(modes.gamma, axis=1)
-    near = np.abs(f - f[:, None]) < np.minimum(modes.ratios * f, (modes.ratios * f)[:, None])
-    return np.any(near & (size[:, None] < weak * size), axis=1)

@@ -13,7 +13,10 @@ from sysid.measurement.channels import without_delays
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles
+from sysid.modal_analysis.first_modes import _newly_late, first_modes, shadows_of
 from sysid.modal_analysis.fit import whole_fit
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.record_fit import ROUGH, record_modes, refitted
 from sysid.modal_analysis.residual_tests import delays_left, delays_of
 
 SETTING = replace(four_storeys(150.0), duration=40.0)
@@ -89,6 +92,35 @@ def test_a_fit_finds_the_delay_that_was_left_in():
     found = delays_of(whole_fit(test, np.zeros(5)))
     assert np.count_nonzero(found.values) == 1
     assert abs(found.values[1] - 0.1 * MS) < 4 * found.std[1]
+
+
+def test_first_modes_tell_which_channels_are_late_and_settle_by_how_much():
+    """Beside what they settle nothing is left, though a step from delays far off ends short of them."""
+    late = np.array([0, 4.0, 0, 4.0, 0]) * MS
+    found, first = first_modes(record(late), np.zeros(5), FitMonitor())
+    std = delays_of(first).std
+    np.testing.assert_array_equal(found != 0, late != 0)
+    assert np.all(np.abs(found - late)[late != 0] < 4 * std[late != 0])
+    assert first.parameters.modes.omega.size == 4
+
+
+def test_a_weak_mode_beside_a_strong_one_does_not_stand_for_a_late_channel():
+    """Beside each mode one of a hundredth of its participation, which explains what is late as far as it can."""
+    late, structure = [0, 2 * MS, 0, 0, 0], SETTING.structure
+    test = record(late)
+    omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
+    poles = {"omega": np.append(omega, 1.002 * omega), "ratios": np.append(ratios, ratios)}
+    fit = record_modes(test, **poles)
+    modes = fit.parameters.modes._replace(**poles)
+    size = np.linalg.norm(modes.gamma[:4], axis=1, keepdims=True)
+    weak = modes._replace(gamma=np.vstack([modes.gamma[:4], 0.01 * size]))
+    np.testing.assert_array_equal(shadows_of(weak), np.repeat([False, True], 4))
+    assert not np.any(shadows_of(weak.at(slice(4))))
+    fit = replace(fit, parameters=fit.parameters.with_modes(weak, fit.parameters.ends))
+    fit = refitted(fit, fit.parameters, limits=ROUGH)
+    found = _newly_late(fit, np.zeros(5), FitMonitor(), 25.0)
+    np.testing.assert_array_equal(np.flatnonzero(found), [1])
+    assert found[1] == pytest.approx(2 * MS, rel=0.02)
 
 
 def test_delays_are_put_back_only_where_the_fit_is_no_worse_without_them(monkeypatch):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.first_modes import leads_to
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import least_worth, peaks_of, pruned, trials_of, without_weak_modes
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
 from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
-from sysid.modal_analysis.rough_poles import leads_to
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths

@@ -10,6 +10,8 @@ from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous_structure
 from benchmarks.records.simulated import Modes as SimulatedModes
 from benchmarks.records.simulated import Run, random_motion, with_noise
+from sysid.modal_analysis.fit import _with_all_modes
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter_over_blocks
@@ -181,6 +183,13 @@ def test_whole_records_ask_for_them_too(truth, whole, fits):
     result = sysid.identify(sysid.Problem(whole, mass=sysid.FullMass()), rng=0)
     off = (result.structure.damping_ratios - truth.damping_ratios[:4]) / result.uncertainty.damping_ratios
     assert result.determined and np.abs(off).max() < 4
+
+
+@pytest.mark.parametrize("much", [False, True])
+def test_a_fit_that_misses_much_of_whole_records_asks_for_them_before_it_is_judged(fits, monkeypatch, much):
+    """Else what modes above the lines add passes for noise of the base, and least squares take the place of noise."""
+    monkeypatch.setattr("sysid.modal_analysis.fit.misses_much", lambda left: much)
+    assert _with_all_modes(fits[0], FitMonitor()).static == 2 * much
 
 
 @pytest.mark.parametrize("force", [False, True])
