@@ -123,6 +123,6 @@ def shadows_of(modes: Modes, weak: float = 0.1) -> NDArray[np.bool_]:
 
     A channel that is late answers as if beside each mode there were such a one.
     """
-    f, size = modes.omega, np.linalg.norm(modes.gamma, axis=1)
-    near = np.abs(f - f[:, None]) < np.minimum(modes.ratios * f, (modes.ratios * f)[:, None])
+    f, half_width, size = modes.omega, modes.ratios * modes.omega, np.linalg.norm(modes.gamma, axis=1)
+    near = np.abs(f - f[:, None]) < np.minimum(half_width, half_width[:, None])
     return np.any(near & (size[:, None] < weak * size), axis=1)
