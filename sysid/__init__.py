@@ -11,7 +11,6 @@ import casadi as _casadi
 
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.export.export import export
-from sysid.files.reading import read
 from sysid.identify import identify
 from sysid.measurement.excited_band import excited_band
 from sysid.measurement.in_time import TimeScores, time_scores
@@ -44,12 +43,14 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 
 if _TYPE_CHECKING:
     from sysid import catalogue, jobs, plot
+    from sysid.files.reading import read
     from sysid.report.report import write_report
 
 _FIRST_USED = {
     "catalogue": "sysid.catalogue",
     "jobs": "sysid.jobs",
     "plot": "sysid.plot",
+    "read": "sysid.files.reading",
     "write_report": "sysid.report.report",
 }
 

@@ -21,7 +21,7 @@ import unicodedata
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +31,7 @@ _TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
 MOST_LISTED = 8  # of many alike, that a message names
 
-RandomSource = int | np.random.Generator | np.random.SeedSequence | None
+RandomSource: TypeAlias = "int | np.random.Generator | np.random.SeedSequence | None"  # NumPy loads it at first use
 
 
 class SysidError(Exception):

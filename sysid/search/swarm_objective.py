@@ -12,7 +12,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
@@ -70,6 +69,8 @@ class HeldSpectrumObjective:
     def __init__(
         self, problem: Prepared, term: TestTerm, spectrum: Array, expansion: ca.Function, threads: int | None = None
     ) -> None:
+        from concurrent.futures import ThreadPoolExecutor  # brings the logging library, which the import does without
+
         test = term.test
         batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
         self.expansion, self._share = expansion, term.weight**2

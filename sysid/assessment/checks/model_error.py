@@ -36,7 +36,6 @@ _LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
 _ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
-_LEAST_RATIO = 1e-4
 
 
 def beyond_noise(context: Context) -> Iterator[Finding]:
@@ -364,7 +363,7 @@ def _modes(modal: ModalEstimate) -> ObservedPoles | None:
     if not omega.size:
         return None
     shapes = shapes / np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
-    return ObservedPoles(omega, np.maximum(ratios, _LEAST_RATIO), shapes)
+    return ObservedPoles(omega, np.maximum(ratios, 1e-4), shapes)  # a pole without damping would have no width
 
 
 def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
