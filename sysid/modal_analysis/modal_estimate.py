@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.measurement.channels import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.calibration import Calibration
@@ -204,6 +205,11 @@ class ModalEstimate:
         """That of lines from which nothing was taken off yet, without these errors of their gains."""
         turned = ModalEstimate.of_lines(calibration.taken_off(self.records))
         return replace(turned, delays=self.delays, calibration=calibration)
+
+    @property
+    def as_recorded(self) -> Measurement:
+        """Its records with what wrong gains add to them, where that was taken off."""
+        return self.records if self.record_fit is None else without_constants(self.records, -self.record_fit.constants)
 
     @property
     def by_modes(self) -> bool:

@@ -262,7 +262,7 @@ def misfits_of_parts(problem: Prepared, structure: Structure) -> Iterator[tuple[
         places = [np.tile(turn, (test.n_sensors, 1)) for turn in turns[far]]
         every = [
             (sums[:, None] * record.T[inside] / std[..., None]).reshape(-1, test.n_sensors)
-            for record in (columns(test.response), *changes, *places)
+            for record in (columns(problem.modal[0].as_recorded.response), *changes, *places)
         ]
         left, softness, mended, gains, delays, *turned = (np.concatenate([one.real, one.imag]) for one in every)
         others = np.hstack([np.zeros((len(left), 0)), *turned])

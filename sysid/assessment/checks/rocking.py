@@ -18,7 +18,6 @@ from sysid.assessment.checks.context import BEYOND, Context, of_tests
 from sysid.assessment.checks.gains import distinct_poles, errors_along, tolerated_errors
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
-from sysid.measurement.channels import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.vector_fitting import find_poles
@@ -85,9 +84,7 @@ def _found(modal: ModalEstimate, structure: Structure, suspected: bool, rounds: 
     The first round takes the poles of the structure in and above the lines; where it shows nothing, there are no
     others, unless the model misses more than noise (`suspected`).
     """
-    test, errors = modal.records, tolerated_errors(modal)
-    if modal.record_fit is not None:  # rocking makes constants too, which a wrong gain stands for
-        test = without_constants(test, -modal.record_fit.constants)
+    test, errors = modal.as_recorded, tolerated_errors(modal)  # rocking makes constants too, as a wrong gain does
     if test.sensors is None:
         return []
     rows, along = rigid_body(sensors=test.sensors, base_axes=BASE_AXES), np.zeros(test.rigid_body.shape)
