@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.channels.brackets import one_test
 from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, LumpedMass, Problem, Sensor, Structure, simulate
 from sysid.assessment.checks import brackets
@@ -162,6 +163,11 @@ class TestRigidPart:
         loose = [dataclasses.replace(one, part="") for one in sensors]
         test = on_bracket(shaken(truth, loose, rng=seed), 0, 3 * truth.natural_frequencies[-1])
         assert not told(sysid.identify(Problem(test), rng=0))
+
+    def test_a_wrong_gain_of_whole_records_is_no_bracket_of_another_sensor(self):
+        """What it adds to the base's motion is taken off such records, but not what it adds to the modes."""
+        found = one_test(("gain", 38))
+        assert not found.told and found.said.startswith("gain: s4 reads 3 % high")
 
     def test_sums_of_sensors_are_those_that_no_rigid_motion_makes(self):
         at = lambda x, axis="x": Sensor(f"{x}{axis}", (7.0, 0.0, x), axis, part="deck")  # noqa: E731

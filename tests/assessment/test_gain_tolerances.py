@@ -285,6 +285,8 @@ def test_poles_that_stand_for_a_wrong_gain_are_not_in_the_answer(records, plain,
     size = ERROR if wrong < 4 else 1 / (1 + ERROR) - 1
     np.testing.assert_allclose(constants[driven], size, atol=0.2 * ERROR)
     assert not np.any(constants[~driven])
+    ratio = np.mean(result.modal[0].as_recorded.response / right.modal[0].records.response, axis=(0, 2))
+    np.testing.assert_allclose(ratio, 1 + ERROR * (np.arange(4) == wrong), atol=0.1 * ERROR)
     np.testing.assert_allclose(
         result.structure.natural_frequencies, right.structure.natural_frequencies, rtol=2e-5
     )  # fmt: skip
