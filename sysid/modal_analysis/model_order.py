@@ -377,14 +377,15 @@ def _of_others(fit: RecordFit) -> NDArray[np.bool_]:
 
 
 def least_of(fit: RecordFit) -> NDArray[np.bool_]:
-    """Modes that noise explains, all together: the one that explains least and those next to it, (m,)."""
+    """Modes that noise explains, all together: the one that explains least and those next to it, (m,); never all."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
     value[_of_others(fit)] = np.inf
     value[no_modes(fit)] = 0.0
+    own = np.count_nonzero(np.isfinite(value))  # of which one is left
     first, *others = np.argsort(value, kind="stable")
-    gone = (np.arange(m) == first) & (value < least) & (m - fit.static > 1)
-    for k in others[:-1]:
+    gone = (np.arange(m) == first) & (value < least) & (own > 1)
+    for k in others[: max(own - 2, 0)]:
         more = gone | (np.arange(m) == k)
         if value[k] >= least or rise(more) >= least:
             break
