@@ -365,7 +365,10 @@ def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, f
         value[np.sort(apart, axis=0)[1:2].min(axis=0, initial=np.inf) > near] = np.inf
         if np.min(value) >= few * least:
             return fit
-        fewer = refitted(fit, without(fit, np.arange(value.size) == np.argmin(value)), monitor=monitor)
+        weakest = np.arange(value.size) == np.argmin(value)
+        fewer = refitted(fit, without(fit, weakest), limits=TRIAL, monitor=monitor)
+        if not fewer.settled and fit.likelihood - fewer.likelihood < least:  # else it would creep on for nothing
+            fewer = refitted(fewer, fewer.parameters, monitor=monitor)
         if not fewer.settled or fit.likelihood - fewer.likelihood >= least:
             return fit
         fit = fewer
