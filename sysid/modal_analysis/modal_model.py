@@ -300,7 +300,7 @@ class SpectralModel:
         """The same of a step's end; infinite where it went beyond all measure."""
         if not np.all(np.isfinite(p.modes.omega)) or np.any(p.modes.ratios >= 1.0):
             return np.inf
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             value = self.chi2(p, levels)
         return value if np.isfinite(value) else np.inf
 

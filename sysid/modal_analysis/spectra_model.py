@@ -171,11 +171,10 @@ class SpectraModel(SpectralModel):
         rigid = np.zeros((self.d, self.d))
         for (i, j), value in zip(self.index.pairs, corner, strict=False):
             rigid[i, j] = rigid[j, i] = value
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):  # a step may go beyond all measure
             omega, ratios = np.exp(np.maximum(log_omega, -FAR)), np.exp(np.maximum(log_ratios, -FAR))
-        return self.with_best_shapes(
-            Modes(np.zeros((self.n, self.m)), self._participations(gamma), omega, ratios), rigid
-        )
+            modes = Modes(np.zeros((self.n, self.m)), self._participations(gamma), omega, ratios)
+            return self.with_best_shapes(modes, rigid)
 
     def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:
         """Parameters with the shapes that leave least of the accelerations; those of `modes` are not read."""
