@@ -96,15 +96,13 @@ def with_couplings(
     if above_them:  # which dampers couple with those in the lines
         static = refitted(fit, at_static_pole(fit), some=some, limits=ROUGH, monitor=monitor, static=model.d)
         other = _coupled(fit, static.parameters, model.d, pruned, some, monitor)
-        more = max(more, other, key=lambda one: one.schwarz)
+        more = max(more, other, key=lambda one: (_takes_energy_out(one), one.schwarz))
     if not more.settled:
         more = refitted(more, more.parameters, some=some, monitor=monitor)
     gained = 2 * (more.likelihood - plain.likelihood)
     least = np.sign(max(count := more.model.unknowns - plain.model.unknowns, 0)) * beyond_chance(abs(count))
     single = more.parameters.coupling is None  # where one mode is left
-    if single or not (
-        more.settled and passive(more.parameters, 2 * np.pi * fit.test.freq[-1]) and gained > beyond * least
-    ):
+    if single or not (more.settled and _takes_energy_out(more) and gained > beyond * least):
         return with_static_modes(fit, monitor=monitor) if above_them and not hidden else plain
     alone = in_the_lines_alone(more.model, more.parameters, more.levels, beyond)
     if alone is None:
@@ -134,10 +132,16 @@ def _coupled(
     while more.model.m - static > 2:  # one may be worth much beside couplings, until the others have moved
         poorest = np.arange(more.model.m) == np.argmin(worth(more))
         fewer = refitted(more, without(more, poorest), some=some, limits=TRIAL, monitor=monitor)
-        if not fewer.settled or more.likelihood - fewer.likelihood > least_worth(more.model):
+        needed = more.likelihood - fewer.likelihood > least_worth(more.model)
+        if not fewer.settled or (needed and (_takes_energy_out(more) or not _takes_energy_out(fewer))):
             break
         more = fewer
     return more
+
+
+def _takes_energy_out(fit: RecordFit) -> bool:
+    """True where `passive` is of its couplings, if any: else a mode that is none may stand for what dampers do."""
+    return fit.parameters.coupling is None or passive(fit.parameters, 2 * np.pi * fit.test.freq[-1])
 
 
 def coupling_of(
