@@ -83,7 +83,8 @@ def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, mon
     if added == 0 or more.likelihood - fit.likelihood < _PROMISING * added * least or np.any(no_modes(more)):
         return None
     more = refitted(more, more.parameters, limits=TRIAL, some=some, monitor=monitor)
-    if not more.settled and more.likelihood - fit.likelihood >= added * least:  # it creeps along a flat valley
+    above = more.model.of_others(more.parameters)[m - fit.static :]
+    if np.any(above) and not more.settled and more.likelihood - fit.likelihood >= added * least:  # along a flat valley
         more = refitted(more, more.parameters, limits=TRIAL._replace(rounds=24), some=some, monitor=monitor)
     while more.settled and more.likelihood - fit.likelihood >= max(added, 1) * least and not np.any(no_modes(more)):
         each = worth(more)
