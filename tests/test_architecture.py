@@ -80,12 +80,12 @@ CEILINGS = {
     # damping, headers as more programs write them (7, beside what was taken away); poles above the lines that settle
     # (33), couplings beside these (12), delays put back, gains in a bounded time (3), day numbers of spreadsheets (4);
     # and late channels told from weak modes beside strong ones, and settled before further modes (75).
-    "lines": 49_535,
+    "lines": 49_540,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables; the first modes.
     "files": 194,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     # Modes left out .2, laws one by one .2, of another level .3, delays .14, gains .2, a reading .2, poles above .2.
-    "branches": 78.02,
+    "branches": 78.05,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

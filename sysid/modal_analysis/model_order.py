@@ -388,10 +388,10 @@ def least_of(fit: RecordFit) -> NDArray[np.bool_]:
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
     value[_of_others(fit)] = np.inf
     value[no_modes(fit)] = 0.0
-    own = np.count_nonzero(np.isfinite(value))  # of which one is left
+    count = int(np.count_nonzero(np.isfinite(value)))  # of which one is left
     first, *others = np.argsort(value, kind="stable")
-    gone = (np.arange(m) == first) & (value < least) & (own > 1)
-    for k in others[: max(own - 2, 0)]:
+    gone = (np.arange(m) == first) & (value < least) & (count > 1)
+    for k in others[: max(count - 2, 0)]:
         more = gone | (np.arange(m) == k)
         if value[k] >= least or rise(more) >= least:
             break

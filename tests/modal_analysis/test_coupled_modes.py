@@ -9,13 +9,15 @@ import pytest
 import sysid
 from sysid.jobs.changes import drawn_from
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis import coupled_modes
 from sysid.modal_analysis.coupled_modes import passive, score_of_couplings
 from sysid.modal_analysis.coupled_spectra import CoupledLines
 from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Parameters
-from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_fit import RecordFit, record_modes
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.response import coupled_flexibility
 
@@ -201,6 +203,17 @@ def test_whole_records_show_a_dashpot_and_no_further_modes(estimated, dashpot):
     assert np.all(found.coupling_std < 0.1 * np.abs(Z).max())
     np.testing.assert_allclose(found.omega, modes.omega, rtol=1e-3)
     np.testing.assert_allclose(found.ratios, modes.ratios, rtol=0.05)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_a_mode_goes_without_which_damping_takes_energy_out(monkeypatch, right):
+    """It stands for what dampers do, and a model that feeds energy in would be refused as a whole."""
+    test, (modes, _) = record(building(), 0.005, np.random.default_rng(4)), modes_of(building())
+    fit = record_modes(test, modes.omega, modes.ratios)
+    assert len(modes.omega) == 3
+    monkeypatch.setattr(coupled_modes, "_takes_energy_out", lambda fit: right or fit.model.m == 2)
+    found = coupled_modes._coupled(fit, fit.parameters, 0, lambda rough: rough, None, FitMonitor())
+    assert found.model.m == (3 if right else 2)
 
 
 def test_without_a_force_modes_are_counted_and_no_coupling_is_told():

@@ -13,6 +13,7 @@ from benchmarks.records.simulated import Run, random_motion, with_noise
 from sysid.modal_analysis.fit import _with_all_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import residual_of
+from sysid.modal_analysis.model_order import least_of
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.residual_tests import scatter_over_blocks
 from sysid.modal_analysis.spectra_modes import ModeFit
@@ -190,6 +191,16 @@ def test_a_fit_that_misses_much_of_whole_records_asks_for_them_before_it_is_judg
     """Else what modes above the lines add passes for noise of the base, and least squares take the place of noise."""
     monkeypatch.setattr("sysid.modal_analysis.fit.misses_much", lambda left: much)
     assert _with_all_modes(fits[0], FitMonitor()).static == 2 * much
+
+
+def test_modes_that_noise_explains_beside_them_are_never_all(fits, monkeypatch):
+    """They stand for others: of no modes of its own there is no fit."""
+    monkeypatch.setattr("sysid.modal_analysis.model_order.joint_worth", lambda fit: lambda modes: 0.0)
+    fit, omega = fits[1], fits[1].parameters.modes.omega
+    within = omega < 2 * np.pi * fit.test.freq[-1]
+    gone = least_of(fit)
+    assert np.count_nonzero(within) > 1
+    assert np.count_nonzero(gone) == np.count_nonzero(within) - 1 and not np.any(gone & ~within)
 
 
 @pytest.mark.parametrize("force", [False, True])
