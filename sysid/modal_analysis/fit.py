@@ -21,6 +21,7 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
 from sysid.modal_analysis.misfit import left_of, misses_much, without_transients
 from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.model_order import (
     least_worth,
     peaks_of,
@@ -333,12 +334,27 @@ def _calibrated(fit: RecordFit, stated: Calibration, monitor: FitMonitor | None)
     """
     found = calibration_of(fit, stated)
     try:
-        calibrated = pruned(on_turned(fit, found.taken_off(fit.test), monitor=monitor), monitor)
+        free = replace(fit, parameters=_without_errors(fit.parameters, found.values))
+        calibrated = pruned(on_turned(free, found.taken_off(fit.test), monitor=monitor), monitor)
         if calibrated.model.m < fit.model.m:
-            return _calibrated(on_turned(calibrated, fit.test, monitor=monitor), stated, monitor)
+            p = _without_errors(calibrated.parameters, 1 / (1 + found.values) - 1)
+            again = replace(calibrated, test=fit.test)
+            again = refitted(again, replace(p, gains=fit.parameters.gains), monitor=monitor)
+            return _calibrated(again, stated, monitor)
         return calibrated, found
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True), stated
+
+
+def _without_errors(p: Parameters, errors: Array) -> Parameters:
+    """Parameters of records without these errors of gains, (n_sensors + 2 d,), of which modes are as recorded.
+
+    A fit beside tolerances has the force's errors, and those of the base in it, among its gains: see `read_by_gains`.
+    """
+    n, d = len(p.modes.phi), len(p.rigid)
+    sensors, base = 1 + errors[:n, None], 1 + errors[n : n + d]
+    modes = p.modes._replace(phi=p.modes.phi / sensors, gamma=p.modes.gamma * base)
+    return replace(p, modes=modes, rigid=p.rigid * np.outer(base, base))
 
 
 def fit_tests(

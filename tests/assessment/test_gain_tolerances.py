@@ -15,7 +15,7 @@ from sysid.jobs.changes import drawn_from
 from sysid.measurement.channels import read_by_gains, seen_at_sensors, without_delays, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import find_delays
-from sysid.modal_analysis.fit import _beside_free_gains, fit_modes, whole_fit
+from sysid.modal_analysis.fit import _beside_free_gains, _without_errors, fit_modes, whole_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.model_order import Peak, with_peak
 from sysid.modal_analysis.record_fit import on_turned
@@ -98,6 +98,20 @@ def test_slopes_of_the_model_of_records_by_gains(records):
         values = [model.chi2(model.unpack(x + times * step), fit.levels) for times in (-2, -1, 1, 2)]
         slope = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step[at])
         assert slope == pytest.approx(-2 * slopes[at], rel=1e-5, abs=1e-6 * np.abs(slopes).max())
+
+
+def test_modes_fit_as_well_once_errors_of_gains_are_taken_off_both(records):
+    """Of modes as recorded there would be left what the errors are, far more than the noise where that is small."""
+    test = dataclasses.replace(misread(records, 0.005 * np.array([1, -1, 1, 0, -1, 1])), **TOLERANCES)
+    fit = whole_fit(test)
+    p, errors = fit.parameters, fit.parameters.gains * Calibration.stated(test).tolerance
+    assert np.count_nonzero(np.abs(errors) > 0.002) > 3
+    free = without_gains(test, errors)
+    chi2 = lambda p: fit.model_of(p, free).chi2(p, fit.levels)  # noqa: E731
+    none = dataclasses.replace(p, gains=np.zeros(0))
+    at_end = fit.chi2 - p.gains @ p.gains / 2
+    assert abs(chi2(_without_errors(none, errors)) - at_end) < 0.01 * at_end
+    assert chi2(none) - at_end > 0.03 * at_end
 
 
 def test_likeliest_errors_of_gains_are_those_of_least_squares(spectra):
