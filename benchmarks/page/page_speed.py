@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -89,23 +90,24 @@ def _of_a_run(folder: Path, reduced: bool) -> Iterator[Line]:
 
 def _of_imports(folder: Path, reduced: bool) -> Iterator[Line]:
     """Processor seconds of the import of the package."""
-    count = 5 if reduced else 15
+    count = 9 if reduced else 15
     text = f"import of sysid beyond NumPy and CasADi, median of {count} processes with compiled files, processor s"
     taken, beside = _import_seconds(folder, count)
     yield from _judged(text, statistics.median, taken, beside if reduced else [], IMPORT)
 
 
 def _import_seconds(folder: Path, count: int) -> tuple[list[float], list[float]]:
-    """Of fresh processes, and of fixed work beside each; as in an installation, Python's compiled files are there."""
+    """Of fresh processes, and of fixed work before and after each; as in an installation, compiled files are there."""
     environment = os.environ | {"PYTHONPYCACHEPREFIX": str(folder / "compiled")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    taken, beside = list[float](), list[float]()
+    taken, beside = list[float](), [fixed_work(1)]
     for _ in range(count + 1):
         command = [sys.executable, "-c", _IMPORTED]
         told = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
         taken.append(float(told))
         beside.append(fixed_work(1))
-    return taken[1:], beside[1:]  # the first process writes the compiled files
+    both = [(before + after) / 2 for before, after in pairwise(beside)]
+    return taken[1:], both[1:]  # the first process writes the compiled files
 
 
 def answer(n: int, count: int, *, force: bool) -> sysid.Identification:
