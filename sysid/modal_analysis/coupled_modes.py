@@ -18,8 +18,8 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import half_inverse, score, unit_diagonal
 from sysid.modal_analysis.modal_estimate import Coupling
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
-from sysid.modal_analysis.model_order import least_worth
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, refitted, without, worth
+from sysid.modal_analysis.model_order import least_worth, worth
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, refitted, without
 from sysid.modal_analysis.record_model import RecordModel
 from sysid.modal_analysis.static_modes import at_static_pole, in_gauge, misses_modes_above, with_static_modes
 from sysid.structure.simulation import ModalModel

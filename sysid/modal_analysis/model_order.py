@@ -10,6 +10,7 @@ lines count for less, and the one block of lines where a mode shows most is no e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -19,20 +20,10 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes
 from sysid.modal_analysis.modal_model import Lines
-from sysid.modal_analysis.record_fit import (
-    ROUGH,
-    TRIAL,
-    WHOLE,
-    Limits,
-    RecordFit,
-    joint_worth,
-    record_modes,
-    refitted,
-    without,
-    worth,
-)
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, record_modes, refitted, without
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.residual_tests import line_blocks, uneven
 from sysid.modal_analysis.response import gains
@@ -118,12 +109,14 @@ def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> R
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
     """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line.
 
-    And for those that drift makes: of less than two periods a record, or of four below the lines.
+    And for those that drift makes: of less than two periods a record, or of four below the lines. A narrow one above
+    the lines, beside static modes, answers for no line: it stands for others, whose damping the lines do not tell.
     """
     modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
     below = modes.omega < 2 * np.pi * fit.test.freq[0]
     slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
-    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
+    narrow = (modes.ratios * modes.omega < RAZOR * line) & ~fit.model.of_others(fit.parameters)
+    return np.asarray((modes.ratios >= DAMPED) | narrow | slow)
 
 
 def least_worth(model: RecordModel) -> float:
@@ -131,6 +124,42 @@ def least_worth(model: RecordModel) -> float:
     inputs = model.d + 2 * len(model.moving)
     couplings = 2 * len(model.coupled) // max(model.m, 1)  # of one mode with the others
     return beyond_chance(model.channels + inputs + 1 + couplings, len(_RATIOS) * model.numbers) / 2
+
+
+def worth(fit: RecordFit, normal: Array | None = None) -> Array:
+    """Rise of ``e' S^-1 e``, about, without each mode, (m,): all else moves as far as it is free.
+
+    With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
+    """
+    rise = joint_worth(fit, normal)
+    value = np.array([rise(one) for one in np.eye(fit.model.m, dtype=bool)])
+    value[fit.model.m - fit.static :] = np.inf  # they stand for all modes above the lines
+    return value
+
+
+def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArray[np.bool_]], float]:
+    """Function of some of the modes, (m,): the same without all of these together."""
+    model, N = fit.model, fit.normal if normal is None else normal
+    unit, m, n, index = units_of(N), model.m, model.n, model.index
+    inverse = np.linalg.inv(N * np.outer(unit, unit) + 1e-10 * np.eye(model.size))
+    shapes = np.arange(index.phi.stop).reshape(n, m)
+    # With its shape at zero neither participation, pole nor transient of a mode show.
+    others = np.hstack([
+        index.gamma.start + np.arange(m * model.d).reshape(m, -1), np.arange(m)[:, None] + index.log_omega.start,
+        np.arange(m)[:, None] + index.log_ratios.start, model.kept + np.arange(model.n_ends).reshape(m, -1),
+    ])  # fmt: skip
+    x = np.divide(model.pack(fit.parameters), unit, out=np.zeros(model.size), where=unit > 0)
+
+    def rise(modes: NDArray[np.bool_]) -> float:
+        couplings = np.flatnonzero(np.any(modes[model.coupled], axis=1))  # a mode that is gone moves no other
+        of_shapes = shapes[:, modes].ravel()
+        lost = np.concatenate([of_shapes, model.coupling.start + couplings])
+        gone = np.concatenate([lost, others[modes].ravel()])
+        # The inverse of this block is the normal matrix of these less what all others explain of it.
+        left = np.linalg.inv(inverse[np.ix_(gone, gone)])[: lost.size, : lost.size]
+        return float(x[lost] @ left @ x[lost])
+
+    return rise
 
 
 class Peak(NamedTuple):

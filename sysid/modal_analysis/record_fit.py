@@ -7,7 +7,6 @@ estimated in turn with the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -275,14 +274,23 @@ def refitted(
 
 
 def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
-    """The fit of the same records with other delays, or errors of gains, taken off."""
+    """The fit of the same records with other delays, or errors of gains, taken off.
+
+    What stands at the ends of turned records is another thing with each delay. Records are linear in it, and it is
+    fitted first, the modes as they are: from none of it steps of the modes lead far away.
+    """
     assert test.whole is not None
-    was = fit.model.whole
+    was, p = fit.model.whole, fit.parameters
     test = replace(test, whole=replace(test.whole, varying=was.varying, plain=was.plain))
-    p = fit.parameters  # what stands at the ends of turned records is another thing with each delay
     traces = np.zeros((*p.traces.shape[:2], trace_count(test)))
-    traces[..., : was.of_sampling] = p.traces[..., : was.of_sampling]
-    return refitted(replace(fit, test=test), replace(p, traces=traces, gains=np.zeros(0)), monitor=monitor)
+    fit, p = replace(fit, test=test), replace(p, traces=traces, gains=np.zeros(0))
+    model = fit.model_of(p)
+    equations, x = model.at_signal(p).normal_equations(p, fit.levels), model.pack(p)
+    ends = model.kept + np.flatnonzero(~model.held[model.kept : model.coupling.start])
+    normal, size = unit_diagonal(equations.normal[np.ix_(ends, ends)])
+    half = half_inverse(normal, ROUND_OFF)
+    x[ends] += half @ (half.T @ (equations.gradient[ends] / size)) / size
+    return refitted(fit, model.unpack(x), monitor=monitor)
 
 
 def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
@@ -462,39 +470,3 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
 def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
     """Parameters of a fit without some modes, (m,)."""
     return fit.parameters.at(~gone)
-
-
-def worth(fit: RecordFit, normal: Array | None = None) -> Array:
-    """Rise of ``e' S^-1 e``, about, without each mode, (m,): all else moves as far as it is free.
-
-    With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
-    """
-    rise = joint_worth(fit, normal)
-    value = np.array([rise(one) for one in np.eye(fit.model.m, dtype=bool)])
-    value[fit.model.m - fit.static :] = np.inf  # they stand for all modes above the lines
-    return value
-
-
-def joint_worth(fit: RecordFit, normal: Array | None = None) -> Callable[[NDArray[np.bool_]], float]:
-    """Function of some of the modes, (m,): the same without all of these together."""
-    model, N = fit.model, fit.normal if normal is None else normal
-    unit, m, n, index = units_of(N), model.m, model.n, model.index
-    inverse = np.linalg.inv(N * np.outer(unit, unit) + 1e-10 * np.eye(model.size))
-    shapes = np.arange(index.phi.stop).reshape(n, m)
-    # With its shape at zero neither participation, pole nor transient of a mode show.
-    others = np.hstack([
-        index.gamma.start + np.arange(m * model.d).reshape(m, -1), np.arange(m)[:, None] + index.log_omega.start,
-        np.arange(m)[:, None] + index.log_ratios.start, model.kept + np.arange(model.n_ends).reshape(m, -1),
-    ])  # fmt: skip
-    x = np.divide(model.pack(fit.parameters), unit, out=np.zeros(model.size), where=unit > 0)
-
-    def rise(modes: NDArray[np.bool_]) -> float:
-        couplings = np.flatnonzero(np.any(modes[model.coupled], axis=1))  # a mode that is gone moves no other
-        of_shapes = shapes[:, modes].ravel()
-        lost = np.concatenate([of_shapes, model.coupling.start + couplings])
-        gone = np.concatenate([lost, others[modes].ravel()])
-        # The inverse of this block is the normal matrix of these less what all others explain of it.
-        left = np.linalg.inv(inverse[np.ix_(gone, gone)])[: lost.size, : lost.size]
-        return float(x[lost] @ left @ x[lost])
-
-    return rise

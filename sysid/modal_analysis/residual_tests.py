@@ -446,6 +446,20 @@ def delays_beside_dampers(fit: RecordFit) -> Array:
     return marginal if found is None or np.any((found != 0) != (marginal != 0)) else found
 
 
+def with_shared_clocks(fit: RecordFit, late: Array) -> Array:
+    """Delays, s, (k,), with those of channels that a late one's explains better than none, as on one clock with it.
+
+    Of a channel that tells its own delay badly, dampers and modes can take the place; it is one number with the other.
+    """
+    step, covariance = _delays(fit, np.eye(late.size))
+    known, each = late != 0, np.unique(late)  # 0 among them
+    across = covariance[np.ix_(~known, known)] @ np.linalg.pinv(covariance[np.ix_(known, known)], hermitian=True)
+    others = step[~known] - across @ (step - late)[known]
+    shared = late.copy()
+    shared[~known] = each[np.argmin(np.abs(others[:, None] - each), axis=1)]
+    return np.where(np.diag(covariance) > 0, shared, late)
+
+
 def delays_of(fit: RecordFit) -> Delays:
     """Delays that were taken off the records of a fit, with their errors at its end."""
     late, of_base = _taken(fit)
@@ -456,12 +470,12 @@ def delays_of(fit: RecordFit) -> Delays:
 
 
 def _taken(fit: RecordFit) -> tuple[Array, bool]:
-    """Columns (k, q) of delays that were taken off, one of all that are the base's; and whether they are."""
+    """Columns (k, q) of delays that were taken off, one of channels that share a clock; and whether all are late."""
     taken = fit.model.whole.taken
     if taken is None:
         return np.zeros((fit.asked.size - fit.asked.delays, 0)), False
     of_base = taken.size > 1 and bool(np.all(taken == taken[0]))
-    return np.ones((taken.size, 1)) if of_base else np.eye(taken.size)[:, taken != 0], of_base
+    return np.asarray(taken[:, None] == np.unique(taken[taken != 0]), dtype=float), of_base
 
 
 def _delays(fit: RecordFit, along: Array, missed: float = _MISSED) -> tuple[Array, Array]:

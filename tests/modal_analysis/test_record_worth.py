@@ -9,9 +9,17 @@ import sysid
 from sysid.modal_analysis.first_modes import leads_to
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_model import Run
-from sysid.modal_analysis.model_order import least_worth, peaks_of, pruned, trials_of, without_weak_modes
+from sysid.modal_analysis.model_order import (
+    joint_worth,
+    least_worth,
+    peaks_of,
+    pruned,
+    trials_of,
+    without_weak_modes,
+    worth,
+)
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
-from sysid.modal_analysis.record_fit import joint_worth, record_modes, refitted, units_of, worth
+from sysid.modal_analysis.record_fit import record_modes, refitted
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths
@@ -113,7 +121,7 @@ def test_modes_lead_to_the_end_of_a_fit_that_has_them_within_the_lines(fit_of_tw
 
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
     fit, _ = fit_of_two
-    model, p, unit = fit.model, fit.parameters, units_of(fit.normal)
+    model, p, unit = fit.model, fit.parameters(fit.normal)
     N, index = fit.normal * np.outer(unit, unit), fit.model.index
 
     def by_solving(modes):
