@@ -15,7 +15,7 @@ from sysid.modal_analysis.misfit import deviations
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import least_of, pruned
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, on_turned, record_modes, refitted, without
-from sysid.modal_analysis.residual_tests import delays_beside_dampers, with_shared_clocks
+from sysid.modal_analysis.residual_tests import delays_beside_dampers, left_of_clocks, with_shared_clocks
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
@@ -57,7 +57,7 @@ def _newly_late(fit: RecordFit, delays: Array, monitor: FitMonitor, times: float
                 if other.schwarz - trial.schwarz >= 5.0 * np.log(fit.model.numbers) / 2:
                     trial, left = other, shared
             if trial.schwarz - fit.schwarz >= times * price_of_delays(delays + left, delays, fit):
-                return np.asarray(left + delays_beside_dampers(trial) * (left != 0))  # a first step may end short
+                return left + left_of_clocks(trial)[0]  # a first step may end short
     return np.zeros(delays.size)
 
 

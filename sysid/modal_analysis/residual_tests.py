@@ -431,9 +431,15 @@ def delays_left(fit: RecordFit, near: float = 0.3, *, missed: float = _MISSED) -
     found = delays_beyond_chance(step[told], covariance[np.ix_(told, told)], least_delay(fit.test))
     if found is not None:
         return found.at(told, step.size).values
+    more, deviations = left_of_clocks(fit, missed)
+    return more if np.any(np.abs(more) > near * deviations) else None
+
+
+def left_of_clocks(fit: RecordFit, missed: float = _MISSED) -> tuple[Array, Array]:
+    """What a step of all unknowns finds left of delays that were taken off, s, (k,), alike on one clock; deviations."""
     late, _ = _taken(fit)
     more, covariance = _delays(fit, late, missed)
-    return late @ more if np.any(np.abs(more) > near * np.sqrt(np.diag(covariance))) else None
+    return late @ more, late @ np.sqrt(np.diag(covariance))
 
 
 def delays_beside_dampers(fit: RecordFit) -> Array:
@@ -462,11 +468,10 @@ def with_shared_clocks(fit: RecordFit, late: Array) -> Array:
 
 def delays_of(fit: RecordFit) -> Delays:
     """Delays that were taken off the records of a fit, with their errors at its end."""
-    late, of_base = _taken(fit)
     taken = fit.model.whole.taken
     if taken is None:
         return Delays.none(fit.test)
-    return Delays(taken, late @ np.sqrt(np.diag(_delays(fit, late)[1])), of_base)
+    return Delays(taken, left_of_clocks(fit)[1], _taken(fit)[1])
 
 
 def _taken(fit: RecordFit) -> tuple[Array, bool]:

@@ -13,11 +13,11 @@ from sysid.measurement.channels import without_delays
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
 from sysid.modal_analysis.direct_terms import beside_poles
-from sysid.modal_analysis.first_modes import _newly_late, first_modes, shadows_of
+from sysid.modal_analysis.first_modes import _newly_late, first_modes, rough_fit, shadows_of
 from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.record_fit import ROUGH, record_modes, refitted
-from sysid.modal_analysis.residual_tests import delays_left, delays_of
+from sysid.modal_analysis.record_fit import ROUGH, on_turned, record_modes, refitted
+from sysid.modal_analysis.residual_tests import delays_left, delays_of, with_shared_clocks
 
 SETTING = replace(four_storeys(150.0), duration=40.0)
 FREQ = np.linspace(1.3, 16.0, 300)
@@ -102,6 +102,34 @@ def test_first_modes_tell_which_channels_are_late_and_settle_by_how_much():
     np.testing.assert_array_equal(found != 0, late != 0)
     assert np.all(np.abs(found - late)[late != 0] < 4 * std[late != 0])
     assert first.parameters.modes.omega.size == 4
+
+
+def test_a_channel_that_hardly_tells_its_delay_is_on_the_clock_of_a_late_one(monkeypatch):
+    """What a model misses may be a delay of its own; that of another is no further number, and the records show it."""
+    test = record([0, 8 * MS, 0, 8 * MS, 0])
+    response, rng = test.response.copy(), np.random.default_rng(1)
+    real, imaginary = rng.standard_normal((2, *response[:, 3].shape))
+    response[:, 3] += 0.6 * np.sqrt(np.mean(np.abs(response[:, 3]) ** 2)) * (real + 1j * imaginary)
+    noisy = replace(test, response=response)
+    shared = with_shared_clocks(rough_fit(noisy, FitMonitor()), np.array([0, 8 * MS, 0, 0, 0]))
+    np.testing.assert_array_equal(shared, np.array([0, 8, 0, 8, 0]) * MS)
+    monkeypatch.setattr("sysid.modal_analysis.residual_tests._missed", lambda _: True)
+    late, fit = first_modes(noisy, np.zeros(5), FitMonitor())
+    assert late[1] == late[3] == pytest.approx(8 * MS, rel=0.03) and not np.any(late[[0, 2, 4]])
+    std = delays_of(fit).std
+    assert std[1] == std[3] > 0  # of one number
+
+
+def test_what_turned_records_hold_at_their_ends_is_fitted_before_the_modes_move(monkeypatch):
+    test = record([0, 30 * MS, 0, 0, 0])
+    fit = rough_fit(test, FitMonitor())
+    monkeypatch.setattr("sysid.modal_analysis.record_fit.refitted", lambda fit, p, **_: replace(fit, parameters=p))
+    turned = on_turned(fit, without_delays(test, np.array([0, 30 * MS, 0, 0, 0])))
+    model, p, before = turned.model, turned.parameters, fit.parameters
+    np.testing.assert_array_equal(p.modes.phi, before.modes.phi)
+    slope = model.gradient(p, fit.levels).gradient[model.kept : model.coupling.start]
+    other = model.gradient(replace(p, traces=0 * p.traces), fit.levels).gradient[model.kept : model.coupling.start]
+    assert np.abs(slope).max() < 1e-6 * np.abs(other).max()
 
 
 def test_a_weak_mode_beside_a_strong_one_does_not_stand_for_a_late_channel():

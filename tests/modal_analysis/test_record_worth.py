@@ -8,6 +8,7 @@ import pytest
 import sysid
 from sysid.modal_analysis.first_modes import leads_to
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import (
     joint_worth,
@@ -121,7 +122,7 @@ def test_modes_lead_to_the_end_of_a_fit_that_has_them_within_the_lines(fit_of_tw
 
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
     fit, _ = fit_of_two
-    model, p, unit = fit.model, fit.parameters(fit.normal)
+    model, p, unit = fit.model, fit.parameters, units_of(fit.normal)
     N, index = fit.normal * np.outer(unit, unit), fit.model.index
 
     def by_solving(modes):
