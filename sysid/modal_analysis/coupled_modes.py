@@ -17,6 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import half_inverse, score, unit_diagonal
 from sysid.modal_analysis.modal_estimate import Coupling
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import NormalEquations, Parameters, SpectralModel
 from sysid.modal_analysis.model_order import least_worth, worth
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, refitted, without
@@ -126,7 +127,8 @@ def _coupled(
     some: Measurement | None, monitor: FitMonitor,
 ) -> RecordFit:  # fmt: skip
     """The fit with couplings, from parameters without them; modes that stood for couplings are left out."""
-    first = replace(p, coupling=np.zeros((p.modes.omega.size,) * 2))
+    modes = _as_large(p.modes, p.modes.omega.size - static) if fit.model.force else p.modes
+    first = replace(p, modes=modes, coupling=np.zeros((p.modes.omega.size,) * 2))
     rough = pruned(refitted(fit, first, some=some, limits=ROUGH, monitor=monitor, static=static))
     more = refitted(rough, rough.parameters, some=some, limits=TRIAL, monitor=monitor)
     while more.model.m - static > 2:  # one may be worth much beside couplings, until the others have moved
@@ -137,6 +139,19 @@ def _coupled(
             break
         more = fewer
     return more
+
+
+def _as_large(modes: Modes, own: int, many: float = 10.0) -> Modes:
+    """The same, those of the first `own` whose shape is `many` times that of the mode of most mass made as large as it.
+
+    Without couplings what dampers do to the base force is missed, and may leave a mode next to no mass. Its residues
+    are then right, and its shape is without bound, from which no step with couplings leads back.
+    """
+    size = np.abs(modes.phi[:, :own]).max(axis=0)
+    usual = size[np.argmax(np.sum(modes.gamma[:own] ** 2, axis=1))]
+    scale = np.ones(modes.omega.size)
+    scale[:own] = np.where(size > many * usual, usual / size, 1.0)
+    return modes._replace(phi=modes.phi * scale, gamma=modes.gamma / scale[:, None])
 
 
 def _takes_energy_out(fit: RecordFit) -> bool:
