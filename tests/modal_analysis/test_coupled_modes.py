@@ -216,6 +216,23 @@ def test_a_mode_goes_without_which_damping_takes_energy_out(monkeypatch, right):
     assert found.model.m == (3 if right else 2)
 
 
+def test_a_mode_that_was_left_next_to_no_mass_gets_it_back_beside_dampers():
+    """Its residues are right, as accelerations want them, and its shape is ten thousand times as large."""
+    test, (modes, _) = record(truth := building(), 0.005, np.random.default_rng(4)), modes_of(building())
+    fit, scale = record_modes(test, modes.omega, modes.ratios), np.array([1.0, 1.0, 1e4])
+    light = fit.parameters.modes._replace(phi=modes.phi * scale, gamma=modes.gamma / scale[:, None])
+    np.testing.assert_array_equal(coupled_modes._as_large(light, 2).phi, light.phi)  # of the first two alone
+    large = coupled_modes._as_large(light, 3)
+    np.testing.assert_allclose(large.phi @ large.gamma, light.phi @ light.gamma)
+    assert np.abs(large.phi[:, 2]).max() == pytest.approx(np.abs(modes.phi[:, 0]).max())
+    found = coupled_modes._coupled(
+        fit, replace(fit.parameters, modes=light), 0, lambda rough: rough, None, FitMonitor()
+    )
+    assert found.settled and found.model.m == 3
+    masses = np.sum(found.parameters.modes.gamma**2, axis=1)
+    np.testing.assert_allclose(masses, np.sum(truth.participation**2, axis=1), rtol=0.05)
+
+
 def test_without_a_force_modes_are_counted_and_no_coupling_is_told():
     """Accelerations leave the scale of each mode open, and with it that of the couplings."""
     found = fit_modes(record(building(), 0.005, np.random.default_rng(4), samples=6000, force=False))
