@@ -109,14 +109,12 @@ def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> R
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
     """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line.
 
-    And for those that drift makes: of less than two periods a record, or of four below the lines. A narrow one above
-    the lines, beside static modes, answers for no line: it stands for others, whose damping the lines do not tell.
+    And for those that drift makes: of less than two periods a record, or of four below the lines.
     """
     modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
     below = modes.omega < 2 * np.pi * fit.test.freq[0]
     slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
-    narrow = (modes.ratios * modes.omega < RAZOR * line) & ~fit.model.of_others(fit.parameters)
-    return np.asarray((modes.ratios >= DAMPED) | narrow | slow)
+    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
 
 
 def least_worth(model: RecordModel) -> float:

@@ -405,6 +405,7 @@ class _Equations:
         """True where a step promises no fall of the sum of squares while modes above the lines stay as they are."""
         here, model = self(p, levels), self.model
         index, stays = model.index, model.of_others(p)
+        stays |= (np.arange(model.m) >= model.m - model.static) & (p.coupling is not None)  # dampers alone move these
         held = np.zeros(model.size, bool)
         held[index.phi] = np.tile(stays, model.n)
         held[index.gamma] = np.repeat(stays, model.d)
