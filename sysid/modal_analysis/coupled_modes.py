@@ -98,9 +98,8 @@ def with_couplings(
         static = refitted(fit, at_static_pole(fit), some=some, limits=ROUGH, monitor=monitor, static=model.d)
         other = _coupled(fit, static.parameters, model.d, pruned, some, monitor)
         more = max(more, other, key=lambda one: (_takes_energy_out(one), one.schwarz))
-    for _ in range(2):  # the first may end at what creeps, as the mass of static modes that dampers alone move
-        if not more.settled and (_ == 0 or _takes_energy_out(more)):
-            more = refitted(more, more.parameters, some=some, monitor=monitor)
+    if not more.settled:
+        more = refitted(more, more.parameters, some=some, monitor=monitor)
     gained = 2 * (more.likelihood - plain.likelihood)
     least = np.sign(max(count := more.model.unknowns - plain.model.unknowns, 0)) * beyond_chance(abs(count))
     single = more.parameters.coupling is None  # where one mode is left
