@@ -141,16 +141,16 @@ def _coupled(
     return more
 
 
-def _as_large(modes: Modes, own: int, many: float = 10.0) -> Modes:
-    """The same, those of the first `own` whose shape is `many` times that of the mode of most mass made as large as it.
+def _as_large(modes: Modes, first: int, many: float = 10.0) -> Modes:
+    """The same; of the `first` so many, shapes beyond `many` times that of the mode of most mass are as large as it.
 
     Without couplings what dampers do to the base force is missed, and may leave a mode next to no mass. Its residues
     are then right, and its shape is without bound, from which no step with couplings leads back.
     """
-    size = np.abs(modes.phi[:, :own]).max(axis=0)
-    usual = size[np.argmax(np.sum(modes.gamma[:own] ** 2, axis=1))]
+    size = np.abs(modes.phi[:, :first]).max(axis=0)
+    usual = size[np.argmax(np.sum(modes.gamma[:first] ** 2, axis=1))]
     scale = np.ones(modes.omega.size)
-    scale[:own] = np.where(size > many * usual, usual / size, 1.0)
+    scale[:first] = np.where(size > many * usual, usual / size, 1.0)
     return modes._replace(phi=modes.phi * scale, gamma=modes.gamma / scale[:, None])
 
 
