@@ -70,24 +70,34 @@ def _stages(
         best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
     left_out: list[FittedLaw] = []
+    hidden: tuple[FittedLaw, ...] = ()  # by what other modes change, as squares are judged by what they leave
+    beside = best
     for omega in linear.parameters.modes.omega[modes]:
-        found, others = best, bool(best.parameters.laws)
-        for found in _with_law_of(best, omega, stated.exponents, tries, limits, monitor):
-            found = _judged(found, [best if others else linear])
-            if found.parameters.laws[-1].likelier:
+        found, others = beside, bool(beside.parameters.laws)
+        for found in _with_law_of(beside, omega, stated.exponents, tries, limits, monitor):
+            found = _judged(found, [beside if others else linear])
+            if not found.parameters.laws[-1].likelier:
+                if stated.modes == "auto" and others:
+                    break  # no exponents make a law of what gains nothing with the first
+            elif not hidden:
                 yield replace(found, left_out=tuple(left_out))
-            elif stated.modes == "auto" and others:
-                break  # no exponents make a law of what gains nothing with the first
-        if others and not best.settled:  # a law's many steps gain by all else too
-            found = _judged(found, [max(best, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
+        if others and not beside.settled:  # a law's many steps gain by all else too
+            found = _judged(found, [max(beside, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
         law = fitted_laws(found)[-1]
         if law.is_certain:
-            best = found
+            if hidden:
+                found, gone = _holding(found, linear, limits, monitor)
+                left_out, hidden = left_out + gone, ()
+            best = beside = found
         else:
-            left_out.append(law)
-            yield replace(best if others else fit, left_out=tuple(left_out))
-        if stated.modes == "auto" and not best.parameters.laws:
+            if plain and not others and found.schwarz > linear.schwarz:
+                beside, hidden = found, (law,)
+            else:
+                left_out.append(law)
+            yield replace(best if best.parameters.laws else fit, left_out=(*hidden, *left_out))
+        if stated.modes == "auto" and not beside.parameters.laws:
             break
+    left_out = [*hidden, *left_out]
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
         if left_of(best) < much:

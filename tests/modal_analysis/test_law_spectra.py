@@ -1,5 +1,6 @@
 """Laws of amplitude as a term of the model of whole records: exact derivatives, and what records tell of them."""
 
+import math
 from copy import copy
 from dataclasses import replace
 
@@ -41,36 +42,39 @@ def moved(base, *, law=True, both=False, by_first=False):
     With `both` the second mode falls too, by the first power of its level; `by_first` as the first one does.
     """
     n = base.size * STEPS
-    halves = scipy.signal.resample(base, 2 * n)
-    fine, middle = halves[::2], halves[1::2]
-    h, size = 1 / (RATE * STEPS), np.abs(PHI[:, 0]).max()
+    fine = scipy.signal.resample(base, 2 * n).tolist()
+    h, sizes = 1 / (RATE * STEPS), np.abs(PHI).max(axis=0).tolist()
+    at_rest, damped_at_rest, gamma = OMEGA.tolist(), RATIOS.tolist(), GAMMA.tolist()
+
+    def slopes_of(k, q, v, u, level=None):
+        """Slopes of one mode, (q', v'), and the level by which it moves: its own, where none is given."""
+        w, zeta, power = at_rest[k], damped_at_rest[k], 0.5 if k == 0 or by_first else 1.0
+        if law and (k == 0 or both or by_first):
+            for _ in range(1 if level is not None else 8):
+                own = sizes[k] * w * math.hypot(w * q, v) / LEVEL if level is None else level
+                w = at_rest[k] * (1 - FALL * own**power)
+            level, zeta = own, zeta + RISE * own
+        return v, -2 * zeta * w * v - w * w * q - gamma[k] * u, level
 
     def slope(y, u):
-        q, v = y
-        w, zeta = OMEGA.copy(), RATIOS.copy()
-        if law:
-            for _ in range(8):
-                level = size * w[0] * np.hypot(w[0] * q[0], v[0]) / LEVEL
-                w[0] = OMEGA[0] * (1 - FALL * np.sqrt(level))
-            zeta[0] = RATIOS[0] + RISE * level
-            if by_first:
-                w[1], zeta[1] = OMEGA[1] * (1 - FALL * np.sqrt(level)), RATIOS[1] + RISE * level
-        if both:
-            for _ in range(8):
-                level = np.abs(PHI[:, 1]).max() * w[1] * np.hypot(w[1] * q[1], v[1]) / LEVEL
-                w[1] = OMEGA[1] * (1 - FALL * level)
-            zeta[1] = RATIOS[1] + RISE * level
-        return np.array([v, -2 * zeta * w * v - w**2 * q - GAMMA * u])
+        *first, level = slopes_of(0, y[0], y[1], u)
+        return *first, *slopes_of(1, y[2], y[3], u, level if by_first else None)[:2]
 
-    y, out = np.zeros((2, 2)), []
+    def further(y, times, by):
+        return [one + times * other for one, other in zip(y, by, strict=True)]
+
+    y, out = [0.0] * 4, []  # (q, v) of each mode
     for k in range(n - 1):
+        u, middle, then = fine[2 * k : 2 * k + 3]
+        a = slope(y, u)
         if k % STEPS == 0:
-            out.append(PHI @ slope(y, fine[k])[1] + fine[k])
-        a = slope(y, fine[k])
-        b = slope(y + h / 2 * a, middle[k])
-        c = slope(y + h / 2 * b, middle[k])
-        y = y + h / 6 * (a + 2 * b + 2 * c + slope(y + h * c, fine[k + 1]))
-    return np.array(out).T
+            out.append([a[1], a[3], u])
+        b = slope(further(y, h / 2, a), middle)
+        c = slope(further(y, h / 2, b), middle)
+        d = slope(further(y, h, c), then)
+        y = [one + h / 6 * (p + 2 * (q + r) + s) for one, p, q, r, s in zip(y, a, b, c, d, strict=True)]
+    motions = np.array(out).T
+    return PHI @ motions[:2] + motions[2]
 
 
 def shaken(level, seed, samples=1200):
@@ -84,7 +88,7 @@ def shaken(level, seed, samples=1200):
 
 
 def test_of(levels, *, law=True, both=False, by_first=False, noise=0.005, seed=0, samples=1200):
-    rng, runs = np.random.default_rng(seed), []
+    rng, runs = np.random.default_rng([seed, 1]), []  # not the numbers of which the base is made
     for number, level in enumerate(levels):
         base = shaken(level, 10 * seed + number, samples)
         response = moved(base, law=law, both=both, by_first=by_first)
@@ -106,6 +110,11 @@ def test():
 def answer(test):
     problem = sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 1.0)))
     return sysid.identify(problem, rng=0)
+
+
+@pytest.fixture(scope="module")
+def plain(test):
+    return sysid.identify(sysid.Problem(test), rng=0)
 
 
 @pytest.mark.parametrize("form, at_rest", [(LawForm(0.5, 0.5, 10.0), False), (LawForm(2.0, -1.0, 10.0), True)])
@@ -149,7 +158,8 @@ def test_the_law_is_found_within_its_deviations(answer):
 
 
 def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
-    problem = sysid.Problem(test_of((0.3, 3.0), both=True), amplitude=sysid.AmplitudeLaw())
+    """Beside what the second mode's changes leave, a law of the first alone is not beyond chance."""
+    problem = sysid.Problem(test_of((0.3, 3.0), both=True, samples=900), amplitude=sysid.AmplitudeLaw())
     answer = sysid.identify(problem, rng=0)
     first, second = answer.structure.laws
     assert (first.form[:2], second.form[:2]) == ((0.5, 1.0), (1.0, 1.0))
@@ -220,9 +230,9 @@ def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
     assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0], rel=1e-3)
 
 
-def test_a_law_is_judged_against_the_fit_without_it_alone(test):
+def test_a_law_is_judged_against_the_fit_without_it_alone(plain):
     """The first mode has a law, which gains enough for two; a law of the second, linear one is left out beside it."""
-    monitor, linear = FitMonitor(), fit_modes(test).record_fit
+    monitor, linear = FitMonitor(), plain.prepared.modal[0].record_fit
     true = with_laws(linear, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), monitor=monitor)
     second = int(np.argmax(true.parameters.modes.omega))
     both = _started(true, second, (0.5, 1.0), (0.0,), WHOLE, monitor)
@@ -233,7 +243,8 @@ def test_a_law_is_judged_against_the_fit_without_it_alone(test):
 
 
 def test_a_law_gains_nothing_by_steps_that_the_fit_without_it_has_not_taken():
-    monitor, linear = FitMonitor(), fit_modes(test_of((0.3, 3.0), law=False, samples=600)).record_fit
+    first = record_modes(test_of((0.3, 3.0), law=False, samples=600), OMEGA, RATIOS)
+    monitor, linear = FitMonitor(), refitted(first, first.parameters)
     p = linear.parameters
     off = replace(p, modes=p.modes._replace(omega=1.03 * p.modes.omega))
     few = refitted(linear, off, limits=Limits(1, 1))
@@ -256,13 +267,12 @@ def test_laws_that_were_left_out_stay_where_the_fit_goes_on(answer, monkeypatch)
     assert [law.likelier for law in prepared.modal[0].laws] == laws
 
 
-def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(test, answer):
+def test_an_unseen_run_is_predicted_far_better_than_by_a_linear_model(plain, answer):
     base = shaken(1.5, 77)
     truth = moved(base)
     unseen = sysid.Measurement.from_time(
         [(base[None, : truth.shape[1]], truth, None)], RATE, rigid_body=np.ones((2, 1)), band=(0.8, 12.0)
     )
-    plain = sysid.identify(sysid.Problem(test), rng=0)
 
     def missed(result):
         return np.linalg.norm(result.predict(unseen) - unseen.relative) / np.linalg.norm(unseen.relative)
@@ -303,8 +313,7 @@ def test_an_export_at_a_level_holds_the_matrices_there_and_names_it(answer, tmp_
     assert not (tmp_path / "wrong.mat").exists()
 
 
-def test_a_level_of_a_structure_without_laws_is_refused(test, tmp_path):
-    plain = sysid.identify(sysid.Problem(test), rng=0)
+def test_a_level_of_a_structure_without_laws_is_refused(plain, tmp_path):
     with pytest.raises(sysid.InputError, match="--amplitude"):
         sysid.export(plain, tmp_path / "there.csv", level=2.5)
 
@@ -328,8 +337,8 @@ def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, number, e
     assert other.laws[0].form[number] == exponent
 
 
-def test_a_fit_that_is_stopped_keeps_the_best_so_far(test):
-    fit = fit_modes(test).record_fit
+def test_a_fit_that_is_stopped_keeps_the_best_so_far(plain):
+    fit = plain.prepared.modal[0].record_fit
     most = []
     for after in (0, 3, 9, 27):
         calls = []
@@ -381,7 +390,8 @@ def test_one_short_run_of_one_level_leaves_the_law_open():
     assert any(one.kind == "amplitude open" for one in result.findings)
 
 
-def test_a_mode_that_the_records_do_not_show_is_refused(test):
+def test_a_mode_that_the_records_do_not_show_is_refused():
+    test = test_of((0.3,), law=False, samples=400)
     with pytest.raises(sysid.InputError, match="mode 5"):
         sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(modes=[5])), rng=0)
 
