@@ -32,9 +32,9 @@ def with_laws(
     Laws come mode by mode, each of exponents of its own. One that the likelihood takes stands in the fit as the next is
     tried; one that it does not is left out of it. "auto" goes on from the first mode where that has a law.
 
-    Where the linear model misses `much`, what it misses passes for noise of the base, which
-    then explains any law: squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these
-    falls of the frequency at the highest level. A `probe` ends where the first law leaves as much.
+    Where the linear model misses `much`, what it misses passes for noise of the base, which then explains any law:
+    squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these falls of the frequency
+    at the highest level. A `probe` ends where the first law leaves as much.
 
     Raises
     ------
@@ -60,8 +60,8 @@ def _stages(
     """The fit with laws that are likelier than none, from stage to stage; the fit itself as long as there are none."""
     whole = fit.model.whole
     plain = left_of(fit) > much or whole.plain
-    whole = replace(whole, plain=plain, varying=None if plain else whole.varying)
-    linear = replace(fit, test=replace(fit.test, whole=whole))
+    varying = None if plain else whole.varying
+    linear = replace(fit, test=replace(fit.test, whole=replace(whole, plain=plain, varying=varying)))
     if plain:
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
@@ -69,35 +69,26 @@ def _stages(
     if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
         best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
     limits = ROUGH if plain else WHOLE  # squares of what a model misses fall slowly at last, by what tells no exponent
-    left_out: list[FittedLaw] = []
-    hidden: tuple[FittedLaw, ...] = ()  # by what other modes change, as squares are judged by what they leave
-    beside = best
+    left_out, hidden = list[FittedLaw](), False  # a first law, by what other modes change, which squares are judged by
     for omega in linear.parameters.modes.omega[modes]:
-        found, others = beside, bool(beside.parameters.laws)
-        for found in _with_law_of(beside, omega, stated.exponents, tries, limits, monitor):
-            found = _judged(found, [beside if others else linear])
-            if not found.parameters.laws[-1].likelier:
-                if stated.modes == "auto" and others:
-                    break  # no exponents make a law of what gains nothing with the first
-            elif not hidden:
+        found, others = best, bool(best.parameters.laws)
+        for found in _with_law_of(best, omega, stated.exponents, tries, limits, monitor):
+            found = _judged(found, [best if others else linear])
+            if found.parameters.laws[-1].likelier and not hidden:
                 yield replace(found, left_out=tuple(left_out))
-        if others and not beside.settled:  # a law's many steps gain by all else too
-            found = _judged(found, [max(beside, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
+            elif stated.modes == "auto" and others and not found.parameters.laws[-1].likelier:
+                break  # no exponents make a law of what gains nothing with the first
+        if others and not best.settled:  # a law's many steps gain by all else too
+            found = _judged(found, [max(best, _without(found, -1, limits, monitor), key=lambda one: one.likelihood)])
         law = fitted_laws(found)[-1]
-        if law.is_certain:
-            if hidden:
-                found, gone = _holding(found, linear, limits, monitor)
-                left_out, hidden = left_out + gone, ()
-            best = beside = found
+        hidden |= (hides := plain and not (others or law.is_certain) and found.schwarz > linear.schwarz)
+        if law.is_certain or hides:
+            best = found
         else:
-            if plain and not others and found.schwarz > linear.schwarz:
-                beside, hidden = found, (law,)
-            else:
-                left_out.append(law)
-            yield replace(best if best.parameters.laws else fit, left_out=(*hidden, *left_out))
-        if stated.modes == "auto" and not beside.parameters.laws:
+            left_out.append(law)
+            yield replace(best if others and not hidden else fit, left_out=tuple(left_out))
+        if stated.modes == "auto" and not best.parameters.laws:
             break
-    left_out = [*hidden, *left_out]
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
         if left_of(best) < much:
@@ -126,8 +117,7 @@ def _with_law_of(
     limits: Limits, monitor: FitMonitor,
 ) -> Iterator[RecordFit]:  # fmt: skip
     """The fit with a law of one more mode, of this frequency, likelier from one to the next."""
-    which = f"a law of amplitude near {omega / (2 * np.pi):.3g} Hz"
-    monitor.doing = which
+    monitor.doing = which = f"a law of amplitude near {omega / (2 * np.pi):.3g} Hz"
     before = best.parameters.laws[-1].form[:2] if best.parameters.laws else (OF_FREQUENCY[0], OF_DAMPING[0])
     first = before if exponents == "auto" else exponents
     started: list[RecordFit] = []
