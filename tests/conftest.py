@@ -1,6 +1,7 @@
 """Random structures that the tests share, built from modes and geometry: their properties are known beforehand."""
 
 import contextlib
+import gc
 import importlib.util
 import os
 import signal
@@ -33,6 +34,15 @@ def _import_benchmarks():
 
 
 _import_benchmarks()
+
+# Python looks through all objects for cycles after each 700 new ones, here among those of six thousand tests.
+gc.set_threshold(20_000, 20, 20)
+
+
+def pytest_collection_finish(session):
+    """Look through what stays to the end no more."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
