@@ -105,7 +105,7 @@ def test_the_answer_has_the_least_huber_loss(strategy):
     assert [phase.name for phase in result.history.phases][-1] == "Huber's loss"
 
 
-def test_two_tests_and_a_known_value_count_by_their_noise(tmp_path, monkeypatch):
+def test_two_tests_and_a_known_value_count_by_their_noise(tmp_path, monkeypatch, no_other_answers):
     # No error of a gain among what is not known, which chance adds here: deviations are compared with those of noise.
     shown = lambda modal, structure: SimpleNamespace(possible=np.zeros(modal.records.n_sensors))  # noqa: E731
     monkeypatch.setattr("sysid.assessment.uncertainty.gain_errors", shown)

@@ -71,10 +71,15 @@ def stopped_callback(error, doing):
 # -- the fit ---------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def whole(storeys):
+    """A fit that nothing stops."""
+    return whole_fit(storeys())
+
+
 @pytest.mark.parametrize("error", [Stop, KeyboardInterrupt])
-def test_a_fit_that_is_stopped_gives_its_best_and_passes_on_what_stopped_it_before_there_was_one(storeys, error):
-    test, truth = storeys(), None
-    whole = whole_fit(test)
+def test_a_fit_that_is_stopped_gives_its_best_and_passes_on_what_stopped_it_before_there_was_one(whole, error):
+    test = whole.test
     assert not whole.stopped
     fit = whole_fit(test, monitor=Stopped(3, error))
     assert fit.stopped and fit.settled and fit.test is test
@@ -184,9 +189,15 @@ def test_what_is_called_regularly_may_end_work_that_asks_nobody():
 # -- the identification ----------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def finished(storeys):
+    """An identification that nothing stops."""
+    return sysid.identify(sysid.Problem(storeys(), mass=sysid.FullMass()), rng=0)
+
+
 @posix
 @pytest.mark.parametrize("way", ["signal", "callback", "its own interrupt"])
-def test_an_identification_ends_with_the_modes_that_a_stopped_fit_had(storeys, tmp_path, monkeypatch, way):
+def test_an_identification_ends_with_the_modes_that_a_stopped_fit_had(storeys, finished, tmp_path, monkeypatch, way):
     problem = sysid.Problem(storeys(), mass=sysid.FullMass())
 
     def callback(progress):
@@ -196,7 +207,7 @@ def test_an_identification_ends_with_the_modes_that_a_stopped_fit_had(storeys, t
             else:
                 raise StopIteration if way == "callback" else KeyboardInterrupt
 
-    before, handler = sysid.identify(problem, rng=0), signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         result = sysid.identify(problem, rng=0, callback=callback)
     finally:
@@ -205,7 +216,7 @@ def test_an_identification_ends_with_the_modes_that_a_stopped_fit_had(storeys, t
     assert result.modal[0].stopped and result.success
     assert result.judgement == "one of many"
     assert [one.numbers["modes"] for one in result.of_kind("modes not all tried")] == [4.0]
-    np.testing.assert_allclose(result.structure.natural_frequencies, before.structure.natural_frequencies, rtol=1e-3)
+    np.testing.assert_allclose(result.structure.natural_frequencies, finished.structure.natural_frequencies, rtol=1e-3)
 
     def refitted(*arguments, **options):
         raise AssertionError("the records were fitted anew")

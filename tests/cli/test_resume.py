@@ -17,9 +17,20 @@ RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
 KEPT = "--modes, --dofs, --data, --set and those of tests from the run in out"
 
 
+@pytest.fixture(scope="module")
+def left():
+    """Files that such a run left, by the text of its module: they may be moved."""
+    return {}
+
+
 @pytest.fixture
-def stopped(here, monkeypatch, no_pictures, capsys, commands):
+def stopped(here, module, left, monkeypatch, no_pictures, capsys, commands):
     """Leave a run of pair.py that Ctrl-C ended in iteration 3 of its swarm; its folder."""
+    if module in left:
+        (here / "out").mkdir()
+        for name, content in left[module].items():
+            (here / "out" / name).write_bytes(content)
+        return here / "out"
     original = sysid.identify
 
     def identify(*arguments, **options):
@@ -33,6 +44,7 @@ def stopped(here, monkeypatch, no_pictures, capsys, commands):
         patch.setattr(cli, "identify", identify)
         assert cli.main(RUN) == 130
     assert commands(capsys.readouterr().err) == [["run", "pair.py", "--resume", "out"]]
+    left[module] = {path.name: path.read_bytes() for path in (here / "out").iterdir()}
     return here / "out"
 
 

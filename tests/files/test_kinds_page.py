@@ -106,7 +106,7 @@ def test_a_recipe_stands_for_each_kind():
 
 
 @pytest.mark.parametrize(("title", "commands"), recipes())
-def test_each_recipe_ends_in_the_judgement_that_the_page_states(folder, capsys, title, commands):
+def test_each_recipe_ends_in_the_judgement_that_the_page_states(folder, capsys, no_pictures, title, commands):
     for line in commands:
         assert cli.main(shlex.split(line)) == 0, capsys.readouterr().err
         if line.startswith("run"):

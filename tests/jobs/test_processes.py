@@ -20,10 +20,10 @@ import multiprocessing
 import time
 from multiprocessing.util import Finalize
 
-from sysid.jobs import processes
-
 
 def leave():
+    from sysid.jobs import processes  # here: the first process does not need it
+
     make = processes(1)
     pool = make()
     {leaves}
