@@ -2,10 +2,8 @@
 
 import contextlib
 import gc
-import hashlib
 import importlib.util
 import os
-import pickle
 import signal
 import sys
 from pathlib import Path
@@ -18,10 +16,9 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.modal_analysis import fit, vector_fitting
+from sysid.modal_analysis import fit
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.model import Geometry
 from sysid.search.continuation import Continuation
 
@@ -85,33 +82,6 @@ def estimates_at_once(request):
             patch.setattr("sysid.modal_analysis.delays.find_delays", lambda test, beside: Delays.none(test))
         if request.path.parent.name in (*after, "assessment"):
             patch.setattr("sysid.modal_analysis.fit.errors_grow", lambda test, poles: False)
-        yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def poles_once(request):
-    """Look for the poles of the same records once in a module, and tell a monitor each time what it was told then.
-
-    One identification does it twice, its checks and its search. The search itself is tested in tests/modal_analysis/.
-    """
-    known, find = {}, vector_fitting._find
-
-    def once(records, progress, rigid_body):
-        key = hashlib.sha256(pickle.dumps((vars(records), rigid_body))).digest()
-        if key in known:
-            poles, told = known[key]
-            for iterations, residual in told:
-                progress.monitor(iterations, residual)
-        else:
-            told, monitor = [], progress.monitor
-            progress.monitor = lambda *state: told.append(state) or monitor(*state)
-            poles = find(records, progress, rigid_body)
-            known[key] = poles, told
-        return Poles(poles.omega.copy(), poles.ratios.copy(), poles.residual)
-
-    with pytest.MonkeyPatch.context() as patch:
-        if request.path.parent.name != "modal_analysis":
-            patch.setattr(vector_fitting, "_find", once)
         yield
 
 

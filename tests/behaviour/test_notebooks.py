@@ -18,6 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sysid.assessment.checks import rocking
+from sysid.modal_analysis import modal_estimate
+
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.py"))
 REAL = [path for path in NOTEBOOKS if "SYSID_DATA" in path.read_text(encoding="utf-8")]
 TIMEOUT = 300  # s a cell, for machines that are busy; a whole notebook takes some ten seconds
@@ -70,6 +73,9 @@ def in_this_process(tmp_path, monkeypatch, from_one_start):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sysid.assessment.checks.model_error.changes", lambda problem: [])
+    once = _once(modal_estimate.find_poles)
+    for module in (modal_estimate, rocking):
+        monkeypatch.setattr(module, "find_poles", once)
     before = mpl.get_backend()
     mpl.use("agg")
 
@@ -89,6 +95,22 @@ def in_this_process(tmp_path, monkeypatch, from_one_start):
 
     yield execute
     mpl.use(before)
+
+
+def _once(find_poles):
+    """The same for all tests of the same spectra, whichever problem holds them."""
+    known = {}
+
+    def found(test, **_):
+        if test.whole is not None:
+            return find_poles(test)
+        parts = test.freq, test.base, test.response, test.rigid_body, test.response_std
+        key = tuple(None if part is None else np.asarray(part).tobytes() for part in parts)
+        if key not in known:
+            known[key] = find_poles(test)
+        return known[key]
+
+    return found
 
 
 def _run_cell(source, file, names):
