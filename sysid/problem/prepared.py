@@ -242,8 +242,9 @@ class Prepared(SearchSpace):
             self.modal = (estimate(more, self.modal[0].calibration), *self.modal[1:])
 
     def fit_modes(self, monitor: FitMonitor) -> None:
-        """Fit the modes of each test, and the laws that are asked for to the problem's own whole records."""
-        self.modal = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor, self.stated.amplitude)
+        """Fit the modes of each test, and laws to the problem's own whole records, if no check asked for them yet."""
+        if "modal" not in vars(self):
+            self.modal = fit_tests(zip(self.stated.tests, self.delays, strict=True), monitor, self.stated.amplitude)
 
     @property
     def laws(self) -> tuple[FittedLaw, ...]:
