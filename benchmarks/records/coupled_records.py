@@ -51,7 +51,7 @@ class Found:
 
 def lines(reduced: bool) -> Iterator[Line]:
     """60 structures, five draws of motion and noise each; or 6 structures, one draw."""
-    structures, draws = (3, 1) if reduced else (60, 5)
+    structures, draws = (6, 1) if reduced else (60, 5)
     answers = spread(draw, [(seed, number) for seed in range(structures) for number in range(draws)])
     what = f"{structures} coupled structures x {draws} draws"
     trials = [a.trial for a in answers]
