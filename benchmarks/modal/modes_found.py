@@ -62,7 +62,7 @@ class Run:
 
 def lines(reduced: bool) -> Iterator[Line]:
     """Noisy tests of random structures; no frequency and no number of modes is given."""
-    seeds, levels = (range(2), (0.01,)) if reduced else (range(100), (0.001, 0.01, 0.03))
+    seeds, levels = (range(4), (0.01,)) if reduced else (range(100), (0.001, 0.01, 0.03))
     tasks = [(seed, level, force) for level in levels for force in (False, True) for seed in seeds]
     runs = dict(zip(tasks, spread(run, tasks), strict=True))
     for level in levels:
