@@ -142,15 +142,19 @@ class Storeys:
 
     def _modal_slope(self) -> Callable[[Array, Array], Array]:
         w, phi = self.modes
-        load, n, size = (phi.T @ self.mass)[:, None], self.mass.size, np.abs(phi[:, 0]).max()
+        load, n, ratios = (phi.T @ self.mass)[:, None], self.mass.size, self.ratios[:, None]
+        first, size = w[0], np.abs(phi[:, 0]).max()
 
         def slope(y: Array, u: Array) -> Array:
             q, v = y[:n], y[n:]
-            now, zeta, level = (np.tile(one[:, None], u.size) for one in (w, self.ratios, 0 * w))
+            now, zeta = np.repeat(w[:, None], u.size, axis=1), np.repeat(ratios, u.size, axis=1)
+            at, level = now[0], np.zeros(u.size)
             for _ in range(7):  # each brings it nearer by a factor of thirty
-                level[0] = size * now[0] * np.hypot(now[0] * q[0], v[0]) / AT
-                now[0] = w[0] * (1 - FALL * np.sqrt(level[0]))
-            return np.concatenate([v, -2 * (zeta + RISE * level) * now * v - now**2 * q - load * u])
+                level = size * at * np.hypot(at * q[0], v[0]) / AT
+                at = first * (1 - FALL * np.sqrt(level))
+            now[0] = at
+            zeta[0] += RISE * level
+            return np.concatenate([v, -2 * zeta * now * v - now**2 * q - load * u])
 
         return slope
 

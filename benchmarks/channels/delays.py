@@ -18,7 +18,7 @@ from benchmarks.modal.spread import spread
 from benchmarks.records.simulated import Modes, Records, Run, Setting, coupled_structure, four_storeys
 
 DRAWS, CLEAN = 120, 100
-SHORT = 6
+SHORT, SHORT_CLEAN = 6, 3
 SAMPLES = (0.05, 30.0)  # of a delay; of spectra two and a half of them are a period of the last line
 BEYOND = 5.0  # deviations, from which a delay is to be found
 WITHIN, DEVIATIONS = 0.03, 3.0  # of a delay, or of its deviations
@@ -59,8 +59,8 @@ class Found:
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """120 draws with a delay and 100 without; or 6 of each."""
-    count, clean = (SHORT, SHORT) if reduced else (DRAWS, CLEAN)
+    """120 draws with a delay and 100 without; or 6 and 3."""
+    count, clean = (SHORT, SHORT_CLEAN) if reduced else (DRAWS, CLEAN)
     every = spread(one_draw, [(number, True) for number in range(count)] + [(number, False) for number in range(clean)])
     late, right = [one for one in every if one.late], [one for one in every if not one.late]
     seen = [one for one in late if not one.size < BEYOND]

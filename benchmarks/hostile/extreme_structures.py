@@ -41,7 +41,7 @@ class End(NamedTuple):
 
 def lines(reduced: bool) -> Iterator[Line]:
     """Verdicts of random structures, noise stated, half of them with lines on all resonances, case by case."""
-    shares = {case: (1 if case == CASES[0] else 10) * (50 if reduced else 1) for case in CASES}
+    shares = {case: (1 if case == CASES[0] else 10) * (100 if reduced else 1) for case in CASES}
     tasks = [(seed, case) for case in CASES for seed in SEEDS[: len(SEEDS) // shares[case]]]
     all_ends = spread(one, tasks)
     for case in CASES:

@@ -24,29 +24,29 @@ def lines(reduced: bool) -> Iterator[Line]:
 
     Workers that have started hold the problem; those of a new pool are forked, and build it. The first pool comes with
     the process that its workers are forked from. Fixed work of NumPy alone runs in turn with the draws: what a second
-    worker can gain on this machine at that time, which two free processors halve. The reduced form tells the share
-    without holding it to the bound.
+    worker can gain on this machine at that time, which two free processors halve. The reduced form has three draws,
+    and tells the share without holding it to the bound.
     """
-    rounds = 2 if reduced else 12
+    rounds, draws = (2, 3) if reduced else (12, DRAWS)
     recipe = sysid.Recipe("cantilever_tower")
     with threadpool_limits(limits=1):
         x = sysid.identify(catalogue.build(recipe), rng=0).x
         assert x is not None
         recipe = replace(recipe, start=tuple(x.tolist()))
-        expected, _ = _drawn(recipe, None)
-        first = _drawn(recipe, jobs.processes(2))[1]
+        expected, _ = _drawn(recipe, None, draws)
+        first = _drawn(recipe, jobs.processes(2), draws)[1]
         held = {1: jobs.processes(1), 2: jobs.processes(2)}
         ways: dict[str, Callable[[], Callable[[], Executor] | None]] = {
             "here": lambda: None, "one": lambda: held[1], "two": lambda: held[2], "new two": lambda: jobs.processes(2),
         }  # fmt: skip
         with bare_pool(1) as bare_one, bare_pool(2) as bare_two:
             ran = [
-                {name: _drawn(recipe, way()) for name, way in ways.items()}
-                | {"bare one": _fixed(bare_one), "bare two": _fixed(bare_two)}
+                {name: _drawn(recipe, way(), draws) for name, way in ways.items()}
+                | {"bare one": _fixed(bare_one, draws), "bare two": _fixed(bare_two, draws)}
                 for _ in range(rounds)
             ]
     alike = [one[name][0] == expected for one in ran for name in ways]
-    yield above(f"{DRAWS} draws of the tower by one worker and by two: runs with the same bits", sum(alike), len(alike))
+    yield above(f"{draws} draws of the tower by one worker and by two: runs with the same bits", sum(alike), len(alike))
     # the first round starts the workers that are held
     least = {name: float(np.min([one[name][1] for one in ran[1:]])) for name in ran[0]}
     told = "; ".join(f"{name} {seconds:.2f}" for name, seconds in least.items())
@@ -58,17 +58,19 @@ def lines(reduced: bool) -> Iterator[Line]:
     yield Line(text, f"{least['new two'] / least['here']:.3g}")
 
 
-def _drawn(recipe: sysid.Recipe, executor: Callable[[], Executor] | None) -> tuple[list[tuple[object, ...]], float]:
+def _drawn(
+    recipe: sysid.Recipe, executor: Callable[[], Executor] | None, draws: int
+) -> tuple[list[tuple[object, ...]], float]:
     """All of the results of the draws, and their seconds."""
     begun = time.perf_counter()
-    ends = sorted(jobs.submit(recipe, draws=DRAWS, executor=executor), key=lambda end: end.index)
+    ends = sorted(jobs.submit(recipe, draws=draws, executor=executor), key=lambda end: end.index)
     return [bits(end) for end in ends], time.perf_counter() - begun
 
 
-def _fixed(pool: Executor) -> tuple[list[tuple[object, ...]], float]:
+def _fixed(pool: Executor, pieces: int) -> tuple[list[tuple[object, ...]], float]:
     """Seconds of as many pieces of fixed work."""
     begun = time.perf_counter()
-    list(pool.map(_piece, range(DRAWS)))
+    list(pool.map(_piece, range(pieces)))
     return [], time.perf_counter() - begun
 
 

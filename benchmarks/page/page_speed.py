@@ -54,8 +54,11 @@ def lines(reduced: bool) -> Iterator[Line]:
             yield below("its bytes", (folder / "larger.html").stat().st_size, MOST_OF_FORTY)
         # one of many: without a force, whose matrices have 840 ends
         taken, beside = [], list[float]()
-        for _ in range(3):
-            taken.append(_seconds(answer(20, 500, force=False).summary))
+        found = answer(20, 500, force=False)
+        for again in range(3):
+            if again:  # one that has told nothing yet: the reduced form copies it
+                found = replace(found) if reduced else answer(20, 500, force=False)
+            taken.append(_seconds(found.summary))
             beside.append(fixed_work(1))
         text = "first summary of 20 sensors without a force, processor s: least"
         yield from _judged(text, min, taken, beside if reduced else [], AT_ONCE)

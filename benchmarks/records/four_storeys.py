@@ -47,8 +47,8 @@ class Statement:
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """By statement: 100 draws of motion and noise each, or 2."""
-    draws = 2 if reduced else 100
+    """By statement: 100 draws of motion and noise each, or one."""
+    draws = 1 if reduced else 100
     trials = spread(draw, [(name, number) for name in STATEMENTS for number in range(draws)])
     for name, statement in STATEMENTS.items():
         own = [t for t in trials if t.group == name]

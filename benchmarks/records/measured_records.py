@@ -30,7 +30,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         return
     event = load_module("mini_shake_table").event
     for name in EVENTS[: 1 if reduced else None]:
-        yield from _deviations(name, event(data / name, "records"), 2 if reduced else SHIFTS)
+        yield from _deviations(name, event(data / name, "records"), 1 if reduced else SHIFTS)
 
 
 def _deviations(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Line]:

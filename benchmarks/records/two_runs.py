@@ -21,8 +21,8 @@ FEW = 1.6  # the same of fewer draws than prove anything
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Full mass, with force; 100 draws of each, or 4."""
-    draws = 4 if reduced else 100
+    """Full mass, with force; 100 draws of each, or 2."""
+    draws = 2 if reduced else 100
     trials = spread(draw, [(name, number) for name in RUNS for number in range(draws)])
     rms = {}
     for name in RUNS:

@@ -20,7 +20,7 @@ SECONDS = 120.0
 
 def lines(reduced: bool) -> Iterator[Line]:
     """Fits, and whether each keeps what it must; seeds, restarts and seconds are told."""
-    seeds = SEEDS[:2] if reduced else SEEDS
+    seeds = SEEDS[:1] if reduced else SEEDS
     for elements in (3,) if reduced else (3, 5):
         problem = load_module("cantilever_tower").problem(elements=elements, noise=0.0, force=False)
         results = [sysid.identify(problem, strategy="hpso-ls", rng=seed) for seed in seeds]
