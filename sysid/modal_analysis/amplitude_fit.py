@@ -45,9 +45,8 @@ def with_laws(
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            for stage in _stages(fit, stated, monitor, much, tries):
-                best = stage
-                if probe and left_of(stage) > much:
+            for best in _stages(fit, stated, monitor, much, tries):
+                if probe and left_of(best) > much:
                     break
     except (Stop, KeyboardInterrupt):
         return replace(best, stopped=True)
