@@ -97,11 +97,13 @@ def test_the_modes_of_spectra_stand_in_the_result_and_are_those_of_its_structure
 
 
 def test_a_written_model_fits_no_modes_and_looks_for_poles_once(monkeypatch):
-    """A check of units before the search, and the box of the damping ratios, read the same poles."""
-    from sysid.modal_analysis import vector_fitting
+    """A check of units before the search, and the box of the damping ratios, read the same poles of one estimate."""
+    from sysid.modal_analysis import fit, vector_fitting
 
     calls, find = [], vector_fitting._find
     monkeypatch.setattr(vector_fitting, "_find", lambda *args: calls.append(1) or find(*args))
+    estimates, of_lines = [], fit._of_lines
+    monkeypatch.setattr(fit, "_of_lines", lambda *args: estimates.append(1) or of_lines(*args))
     m, k = np.array([2.0, 1.0]), np.array([3e3, 2e3])
     K = np.array([[k.sum(), -k[1], -k[0]], [-k[1], k[1], 0.0], [-k[0], 0.0, k[0]]])
     truth = sysid.Structure(np.diag([*m, 0.0]), K, [0.02, 0.02], n_base=1)
@@ -109,4 +111,4 @@ def test_a_written_model_fits_no_modes_and_looks_for_poles_once(monkeypatch):
     problem = sysid.Problem(test, mass=sysid.LumpedMass(), stiffness=sysid.ChainStiffness(1e2, 1e5))
     result = sysid.identify(problem, rng=0)
     assert result.success and result.modal[0].omega.size == 0
-    assert len(calls) == 1
+    assert len(calls) == len(estimates) == 1
