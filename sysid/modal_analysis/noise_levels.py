@@ -222,10 +222,11 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
         e = scale * error
         inner = np.sum(V.conj() * e, axis=1)
         Ge = e - np.sum(V * inner[:, None], axis=0)
-        inverse = np.moveaxis(np.linalg.inv(np.moveaxis(factor, -1, 0)), 0, -1)  # of L, (d, d, L)
-        GT = np.einsum("icl,ijl->jcl", V, inverse)
+        unit = np.eye(len(V))[:, :, None]
+        both = _over(np.concatenate([V, np.broadcast_to(unit, factor.shape)], axis=1), factor)
+        GT, inverse = both[:, :c], both[:, c:]  # of L, transposed
         TGe = np.sum(GT.conj() * e, axis=1)
-        TGT = np.eye(len(V))[:, :, None] - np.einsum("kil,kjl->ijl", inverse.conj(), inverse)
+        TGT = unit - np.sum(inverse[:, None].conj() * inverse, axis=2)
         size = error.shape[1]
         diagonal = np.diagonal(factor).real
         value -= float(2 * np.sum(np.log(diagonal)) + size / v.shape[1] * np.sum(np.log(v[:c])))
@@ -252,6 +253,16 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
                           [between.T, np.sum(_squares(TGT), axis=2)]])  # fmt: skip
         fisher += design.T @ pairs @ design
     return value, score, fisher
+
+
+def _over(rows: ComplexArray, factor: ComplexArray) -> ComplexArray:
+    """X (d, k, L) with ``X L = rows`` at each line, L (d, d, L) the factor of `base_noise`."""
+    out = rows.copy()
+    for i in reversed(range(len(out))):
+        for j in range(i + 1, len(out)):
+            out[i] -= out[j] * factor[j, i]
+        out[i] /= factor[i, i].real
+    return out
 
 
 def _squares(values: ComplexArray) -> Array:
