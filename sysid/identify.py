@@ -97,7 +97,8 @@ def identify(
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         clocks = clocks_of(problem)
         prepared = Prepared(problem, delays=[clock.delays for clock in clocks])
-        named = check_records(prepared, clocks)
+        with _telling_why(session, ()), session.fit_monitor() as monitor:
+            named = check_records(prepared, clocks, monitor)
         with _telling_why(session, named):
             prepare(prepared, session)
         with _telling_why(session, named, prepared):

@@ -13,6 +13,7 @@ from sysid.assessment.checks import CHECKS, OF_THE_END, QUICK
 from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.mistakes import check_records
 from sysid.finding import KINDS, Finding, Severity, is_fit, judgement_of, weightiest_first
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.problem.prepared import clocks_of
 from sysid.search.strategy import Outcome
 
@@ -45,7 +46,7 @@ def test_the_page_on_mistakes_has_a_row_for_each_check_in_their_order():
 def test_all_but_blocking_checks_wait_for_the_end_of_a_search():
     truth = sysid.Structure(np.diag([1.0, 0.0]), 900.0 * np.array([[1.0, -1], [-1, 1]]), [0.02], n_base=1)
     problem = sysid.Problem(sysid.simulate(truth, np.linspace(2, 8, 60)), mass=sysid.FullMass())
-    assert check_records(problem.prepared, clocks_of(problem)) == ()
+    assert check_records(problem.prepared, clocks_of(problem), FitMonitor()) == ()
     assert not {"screened", "at_rest", "formulation"} & set(vars(problem))  # nothing is fitted before a search
     assert set(OF_THE_END) < set(QUICK) < set(CHECKS)
     end = Outcome(truth, problem.values(truth), "by hand", False, "no end", sysid.History())

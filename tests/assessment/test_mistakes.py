@@ -12,6 +12,7 @@ from sysid import FullMass, InputError, LumpedMass, Problem, SpectralStiffness, 
 from sysid.assessment.checks import stated
 from sysid.assessment.checks.mistakes import check_records, mistakes_of
 from sysid.modal_analysis.direct_terms import direct_terms
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.problem.prepared import clocks_of
 
 BY_RECORDS = [
@@ -155,7 +156,7 @@ def test_right_units_show_in_the_first_structures_that_a_model_allows(monkeypatc
     seen, structures = [], stated._structures
     monkeypatch.setattr(stated, "_structures", lambda of: (seen.append(one) or one for one in structures(of)))
     stated_problem = problem(form, right(SPECTRA, force=force).test)
-    assert check_records(stated_problem.prepared, clocks_of(stated_problem)) == ()
+    assert check_records(stated_problem.prepared, clocks_of(stated_problem), FitMonitor()) == ()
     assert 1 <= len(seen) <= 6
 
 

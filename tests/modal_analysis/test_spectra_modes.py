@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -112,3 +113,14 @@ def test_a_written_model_fits_no_modes_and_looks_for_poles_once(monkeypatch):
     result = sysid.identify(problem, rng=0)
     assert result.success and result.modal[0].omega.size == 0
     assert len(calls) == len(estimates) == 1
+
+    def endless(test, delays, calibration, monitor):
+        with monitor.at_work():
+            for _ in range(500):
+                time.sleep(0.01)
+                monitor.check()
+        pytest.fail("five seconds, and nobody stopped it")
+
+    monkeypatch.setattr(fit, "_of_lines", endless)
+    with pytest.raises(sysid.SolverError, match="the time was over"):
+        sysid.identify(problem, rng=0, max_time=0.5)

@@ -23,6 +23,7 @@ from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.delays import Clock, Delays
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.rough_poles import poles_of_test
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
@@ -332,7 +333,7 @@ def _digits(delay: float, std: float, of_base: bool) -> str:
     return f"{round((-1) ** of_base * delay, digits):.9g}"
 
 
-def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding, ...]:
+def check_records(prepared: Prepared, clocks: Sequence[Clock], monitor: FitMonitor) -> tuple[Finding, ...]:
     """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
 
     Raises InputError where one spoils all channels, or a channel of a problem whose model has a form of its own, so
@@ -340,7 +341,7 @@ def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding,
     """
     problem, declared = prepared.stated, prepared.stated.declared
     fitted = clocks[problem.misfit is not None :]
-    found = of_tests([_of_test(prepared, declared, clock, first=clock is clocks[0]) for clock in fitted])
+    found = of_tests([_of_test(prepared, declared, clock, monitor, first=clock is clocks[0]) for clock in fitted])
     every = tuple(found)
     # A gain of one sensor may be fitted so far that the rest is of use.
     fitted_all_the_same = lambda one: declared.free_modes or one.kind in ("gain", "short segments")  # noqa: E731
@@ -349,7 +350,9 @@ def check_records(prepared: Prepared, clocks: Sequence[Clock]) -> tuple[Finding,
     return every
 
 
-def _of_test(problem: Prepared, declared: Formulation, clock: Clock, *, first: bool) -> list[Finding]:
+def _of_test(
+    problem: Prepared, declared: Formulation, clock: Clock, monitor: FitMonitor, *, first: bool
+) -> list[Finding]:
     test = clock.test
     try:
         terms = direct_terms(test, clock.beside)
@@ -361,7 +364,7 @@ def _of_test(problem: Prepared, declared: Formulation, clock: Clock, *, first: b
                 terms = direct_terms(test)
                 found = mistakes_of(test, terms)
         if first and not found and terms is not None:
-            found = list(wrong_statements(problem, declared, test, terms))
+            found = list(wrong_statements(problem, declared, test, terms, monitor))
         if not found and test.averaged:
             found = list(unresolved(test, *poles_of_test(test)))
     except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so

@@ -19,6 +19,7 @@ from sysid.files.units import POUND, STANDARD_GRAVITY
 from sysid.finding import Finding, Severity, contradicting
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.residues import Records, force_residual_left
 from sysid.modal_analysis.response import weighed_mass, weighed_mass_std
 from sysid.modal_analysis.rough_poles import poles_of_test
@@ -352,11 +353,14 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[Finding]:
 
 
 def wrong_statements(
-    problem: Prepared, declared: Formulation, test: Measurement, terms: DirectTerms
+    problem: Prepared, declared: Formulation, test: Measurement, terms: DirectTerms, monitor: FitMonitor
 ) -> Iterator[Finding]:
-    """Masses and frequencies that are stated in another unit than the records show, before a search."""
+    """Masses and frequencies that are stated in another unit than the records show, before a search.
+
+    The monitor may stop the fit of modes that frequencies are compared with.
+    """
     yield from _of_mass(declared, test, terms)
-    yield from _of_frequencies(problem, declared, test)
+    yield from _of_frequencies(problem, declared, test, monitor)
 
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -398,13 +402,17 @@ def _masses(declared: Formulation) -> Iterator[Array]:
         yield from (np.diag(structure.rigid_body_mass) for structure in _structures(declared))
 
 
-def _of_frequencies(problem: Prepared, declared: Formulation, test: Measurement) -> Iterator[Finding]:
+def _of_frequencies(
+    problem: Prepared, declared: Formulation, test: Measurement, monitor: FitMonitor
+) -> Iterator[Finding]:
     """Lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
     stated = getattr(problem.stated.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
         return
     # The search reads the poles of lines that stand for themselves, and finds them here already.
     plain = problem.in_squares and not any(one.is_whole for one in problem.stated.tests)
+    if plain:
+        problem.fit_modes(monitor)
     found = (problem.geometry.poles.omega if plain else poles_of_test(test)[0]) / (2 * np.pi)
     if stated is not None:
         low = high = np.atleast_1d(np.array(stated, dtype=float))
