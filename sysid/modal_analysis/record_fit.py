@@ -379,8 +379,8 @@ class _Equations:
     """Normal equations of one fit; their matrix is kept as long as parameters and levels hardly move.
 
     Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time. The
-    logarithm of a damping ratio above the lines, beside static modes, counts as known to `known` at least: it hardly
-    shows, and a long step of it would be refused with those of all others.
+    logarithm of a damping ratio that is next to `none`, or above the lines beside static modes, counts as known to
+    `known` at least: it hardly shows, and a long step of it would be refused with those of all others.
     """
 
     def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
@@ -388,14 +388,17 @@ class _Equations:
         self.at: tuple[Parameters, Array] | None = None
         self.normal: Array = np.zeros((0, 0))
 
-    def __call__(self, p: Parameters, levels: Array, near: float = 0.2, known: float = 3.0) -> NormalEquations:
+    def __call__(
+        self, p: Parameters, levels: Array, near: float = 0.2, known: float = 3.0, none: float = 1e-6
+    ) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
         still = self.at is not None and not self.model.laws  # of laws a gradient takes as long as the matrix
         if still and self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
         self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
-        ratios = np.r_[self.model.index.log_ratios][self.model.of_others(p)]
+        hardly = self.model.of_others(p) | (p.modes.ratios < none)
+        ratios = np.r_[self.model.index.log_ratios][hardly]
         self.normal[ratios, ratios] = np.maximum(self.normal[ratios, ratios], known**-2)
         if self.of_matrix is not self.model:
             equations = self.model.gradient(p, levels)

@@ -9,6 +9,7 @@ import sysid
 from sysid.modal_analysis.first_modes import leads_to
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import units_of
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import (
     joint_worth,
@@ -118,6 +119,18 @@ def test_modes_lead_to_the_end_of_a_fit_that_has_them_within_the_lines(fit_of_tw
         modes._replace(omega=np.array([modes.omega[0], 1.2 * last])), fit.parameters.ends
     ))  # fmt: skip
     assert leads_to(above, modes._replace(omega=np.array([modes.omega[0], 1.5 * last])))
+
+
+def test_a_pole_above_the_lines_without_damping_holds_no_other_mode(fit_of_two):
+    """Its damping hardly shows: a step of its logarithm as long as that allows is beyond all measure."""
+    fit, _ = fit_of_two
+    modes, last = fit.parameters.modes, 2 * np.pi * fit.test.freq[-1]
+    above = Modes(0.3 * modes.phi[:, :1], modes.gamma[:1], np.array([1.5 * last]), np.array([1e-13]))
+    moved = modes._replace(omega=1.001 * modes.omega).joined(above)
+    p = fit.parameters.with_modes(moved, np.vstack([fit.parameters.ends, fit.parameters.ends[:1]]))
+    again = refitted(fit, p)
+    assert again.likelihood > fit.likelihood - 1.0
+    assert again.parameters.modes.omega[:-1] == pytest.approx(modes.omega, rel=1e-4)
 
 
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):
