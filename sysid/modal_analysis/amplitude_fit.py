@@ -25,16 +25,17 @@ from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
 def with_laws(
     fit: RecordFit, stated: AmplitudeLaw, *, monitor: FitMonitor, much: float = 0.1,
-    tries: tuple[float, ...] = (0.0, 0.03), probe: bool = False,
+    noise: float = 0.03, tries: tuple[float, ...] = (0.0, 0.03), probe: bool = False,
 ) -> RecordFit:  # fmt: skip
     """The fit with laws of the stated modes, numbered from 1 by frequency within the lines; `left_out` are the others.
 
     Laws come mode by mode, each of exponents of its own. One that the likelihood takes stands in the fit as the next is
     tried; one that it does not is left out of it. "auto" goes on from the first mode where that has a law.
 
-    Where the linear model misses `much`, what it misses passes for noise of the base, which then explains any law:
-    squares are fitted, the base as recorded, as long as as much is missed. Laws begin at these falls of the frequency
-    at the highest level. A `probe` ends where the first law leaves as much.
+    Where the linear model misses more than `noise` may, what it misses passes for noise of the base, which then
+    explains any law: squares are fitted, the base as recorded, and noise comes back at the end, where laws leave less
+    than `much` and no more with it. Laws begin at these falls of the frequency at the highest level. A `probe` ends
+    where the first law leaves `much`.
 
     Raises
     ------
@@ -45,7 +46,7 @@ def with_laws(
     try:
         with monitor.at_work():
             monitor.keep_instead(fit)
-            for best in _stages(fit, stated, monitor, much, tries):
+            for best in _stages(fit, stated, monitor, much, noise, tries):
                 if probe and left_of(best) > much:
                     break
     except (Stop, KeyboardInterrupt):
@@ -54,11 +55,11 @@ def with_laws(
 
 
 def _stages(
-    fit: RecordFit, stated: AmplitudeLaw, monitor: FitMonitor, much: float, tries: tuple[float, ...]
+    fit: RecordFit, stated: AmplitudeLaw, monitor: FitMonitor, much: float, noise: float, tries: tuple[float, ...]
 ) -> Iterator[RecordFit]:
     """The fit with laws that are likelier than none, from stage to stage; the fit itself as long as there are none."""
     whole = fit.model.whole
-    plain = left_of(fit) > much or whole.plain
+    plain = left_of(fit) > noise or whole.plain
     varying = None if plain else whole.varying
     linear = replace(fit, test=replace(fit.test, whole=replace(whole, plain=plain, varying=varying)))
     if plain:

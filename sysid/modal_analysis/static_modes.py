@@ -25,7 +25,8 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     See `ModeFit.with_static` of spectra.
     """
     test, d = fit.test, fit.test.n_base
-    if fit.static or fit.stopped or not misses_modes_above(fit):
+    by_laws = fit.model.whole.plain and fit.parameters.laws  # squares: what laws miss is no mode's
+    if by_laws or fit.static or fit.stopped or not misses_modes_above(fit):
         return fit
     first, far = at_static_pole(fit), STATIC_POLE[0] * 2 * np.pi * float(test.freq[-1])
     monitor = monitor or FitMonitor()

@@ -25,6 +25,7 @@ from sysid.modal_analysis.amplitude_fit import (
 )
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.misfit import left_of
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
 from sysid.structure.amplitude import LawForm
@@ -77,6 +78,33 @@ def moved(base, *, law=True, both=False, by_first=False):
     return PHI @ motions[:2] + motions[2]
 
 
+def rubbing(base, size=0.06, smooth=0.003):
+    """Absolute accelerations of the same, linear but for friction in both storeys, N, as `moved` has them."""
+    n, h = base.size * STEPS, 1 / (RATE * STEPS)
+    fine, drifts = scipy.signal.resample(base, 2 * n), np.array([PHI[0], PHI[1] - PHI[0]]).tolist()
+    (a, b), (c, d) = drifts
+    loss, rise, load = (2 * RATIOS * OMEGA).tolist(), (OMEGA**2).tolist(), np.outer(fine, GAMMA).tolist()
+
+    def slope(q, r, v, w, u):
+        first, second = size * math.tanh((a * v + b * w) / smooth), size * math.tanh((c * v + d * w) / smooth)
+        of_first = -loss[0] * v - rise[0] * q - a * first - c * second - u[0]
+        return v, w, of_first, -loss[1] * w - rise[1] * r - b * first - d * second - u[1]
+
+    def further(y, times, by):
+        return [one + times * other for one, other in zip(y, by, strict=True)]
+
+    y, out = [0.0] * 4, []
+    for k in range(n - 1):
+        one = slope(*y, load[2 * k])
+        if k % STEPS == 0:
+            out.append(one[2:])
+        two = slope(*further(y, h / 2, one), load[2 * k + 1])
+        three = slope(*further(y, h / 2, two), load[2 * k + 1])
+        four = slope(*further(y, h, three), load[2 * k + 2])
+        y = [at + h / 6 * (p + 2 * (q + r) + s) for at, p, q, r, s in zip(y, one, two, three, four, strict=True)]
+    return PHI @ np.transpose(out) + base
+
+
 def shaken(level, seed, samples=1200):
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft(rng.standard_normal(samples))
@@ -87,11 +115,11 @@ def shaken(level, seed, samples=1200):
     return level * base / base.std() * np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
 
 
-def test_of(levels, *, law=True, both=False, by_first=False, noise=0.005, seed=0, samples=1200):
+def test_of(levels, *, noise=0.005, seed=0, samples=1200, by=moved, **how):
     rng, runs = np.random.default_rng([seed, 1]), []  # not the numbers of which the base is made
     for number, level in enumerate(levels):
         base = shaken(level, 10 * seed + number, samples)
-        response = moved(base, law=law, both=both, by_first=by_first)
+        response = by(base, **how)
         noisy = response + noise * response.std(axis=1, keepdims=True) * rng.standard_normal(response.shape)
         runs.append((base[None] + noise * base.std() * rng.standard_normal(base.size), noisy, None))
     sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x") for i in (1, 2)]
@@ -253,6 +281,17 @@ def test_a_law_gains_nothing_by_steps_that_the_fit_without_it_has_not_taken():
     assert without.likelihood == pytest.approx(linear.likelihood, abs=0.1)
     likelier = [_judged(law, [other]).parameters.laws[0].likelier for other in (few, without)]
     assert likelier == [True, False]
+
+
+def test_noise_of_the_base_does_not_stand_for_what_laws_of_friction_miss():
+    fit = record_modes(test_of((0.3, 1.0, 3.0), seed=3, samples=600, by=rubbing), OMEGA, 1.3 * RATIOS)
+    linear = refitted(fit, fit.parameters, monitor=FitMonitor())
+    assert 0.03 < left_of(linear) < 0.1
+    found = with_laws(linear, sysid.AmplitudeLaw(exponents=(0.5, -1.0)), monitor=FitMonitor())
+    assert found.model.whole.plain and len(found.parameters.laws) == 2
+    assert left_of(found) < 0.2 * left_of(linear)
+    assert found.parameters.modes.omega[0] == pytest.approx(OMEGA[0], rel=2e-4)  # 4e-4 and more beside that noise
+    assert found.parameters.modes.ratios[0] == pytest.approx(RATIOS[0], rel=0.01)
 
 
 def test_laws_that_were_left_out_stay_where_the_fit_goes_on(answer, monkeypatch):
