@@ -73,7 +73,8 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
     gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
-    found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
+    of_force = force_misfit(formulation, test, structure, modal.calibration)
+    found = [*_at_rest(modal), *leaks, *misses, *of_force, *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):
         found += _damping(records, poles, free)

@@ -18,6 +18,7 @@ from sysid.errors import InputError, listed
 from sysid.files.units import POUND, STANDARD_GRAVITY
 from sysid.finding import Finding, Severity, contradicting
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.direct_terms import DirectTerms
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.residues import Records, force_residual_left
@@ -239,7 +240,7 @@ def stated_masses(context: Context) -> Iterator[Finding]:
     problem, structure = context.problem.screened, context.end.structure
     for check in (_stated_mass, _known_entries, _lumped_total):
         yield from check(problem, structure)
-    yield from force_misfit(problem.formulation, problem.measurement, structure)
+    yield from force_misfit(problem.formulation, problem.measurement, structure, problem.modal[0].calibration)
 
 
 def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
@@ -301,8 +302,10 @@ def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def force_misfit(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[Finding]:
-    """The base force is not that of the modes that the accelerations show."""
+def force_misfit(
+    formulation: Formulation, test: Measurement, structure: Structure, calibration: Calibration | None
+) -> Iterator[Finding]:
+    """The base force is not that of the modes that the accelerations show, nor are gains within tolerances why."""
     if test.force is None or below_lines(test, structure).size:
         return
     entries, n = formulation.mass.entries, formulation.geometry.n
@@ -318,7 +321,8 @@ def force_misfit(formulation: Formulation, test: Measurement, structure: Structu
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
     velocity = not structure.modal_damping
     possible = max(force_residual_left(test, *distinct_poles(structure), velocity=velocity), EXACT)
-    if misfit > max(MISFIT * possible, NEGLIGIBLE):
+    gains = 0.0 if calibration is None else float(np.sqrt(np.diag(calibration.covariance).max()))
+    if misfit > max(MISFIT * np.hypot(possible, gains), NEGLIGIBLE):
         yield Finding(
             "force misfit", Severity.CONTRADICTS,
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
