@@ -16,7 +16,7 @@ from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.misfit import at_lines, left_of
 from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, refitted, rough_levels
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, as_one, refitted, rough_levels
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array
@@ -225,8 +225,7 @@ def _like(modes: Modes, k: int, assurance: float = 0.9, reach: float = 0.2) -> N
 def _beginnings(fit: RecordFit, omega: float, monitor: FitMonitor) -> list[tuple[RecordFit, int]]:
     """Fits to which a law of the mode nearest to a frequency is added, and its number there.
 
-    Where it shows at several levels, first with all these as one mode: from their mean pole and the sum of their
-    residues, as they may be large and cancel one another.
+    Where it shows at several levels, first with all these as one mode.
     """
     p, numbers = fit.parameters, np.arange(fit.model.m)
     free = ~np.isin(numbers, [law.mode for law in p.laws])
@@ -234,17 +233,8 @@ def _beginnings(fit: RecordFit, omega: float, monitor: FitMonitor) -> list[tuple
     like = free & _like(p.modes, k)
     if np.count_nonzero(like) == 1:
         return [(fit, k)]
-    same = p.modes.at(like)
-    u, s, vt = np.linalg.svd(same.phi @ same.gamma)
-    # A force weighs the mode: it answers by the squares of participations.
-    size = float(np.linalg.norm(same.gamma @ vt[0])) if fit.model.force else float(np.sqrt(s[0]))
-    kept = p.at(~like | (numbers == k))
-    number = int(np.count_nonzero(~like[:k]))
-    modes = Modes(*(part.copy() for part in kept.modes))
-    modes.phi[:, number], modes.gamma[number] = u[:, 0] * s[0] / max(size, ROUND_OFF), vt[0] * size
-    modes.omega[number], modes.ratios[number] = (np.exp(np.mean(np.log(part))) for part in same[2:])
-    once = refitted(fit, replace(kept, modes=modes), limits=ROUGH, monitor=monitor)
-    return [(once, number), (fit, k)]
+    once = refitted(fit, as_one(fit, like, k), limits=ROUGH, monitor=monitor)
+    return [(once, int(np.count_nonzero(~like[:k]))), (fit, k)]
 
 
 def _started(

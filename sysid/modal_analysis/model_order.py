@@ -23,7 +23,17 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import units_of
 from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes
 from sysid.modal_analysis.modal_model import Lines
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, record_modes, refitted, without
+from sysid.modal_analysis.record_fit import (
+    ROUGH,
+    TRIAL,
+    WHOLE,
+    Limits,
+    RecordFit,
+    as_one,
+    record_modes,
+    refitted,
+    without,
+)
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.residual_tests import line_blocks, uneven
 from sysid.modal_analysis.response import gains
@@ -375,11 +385,30 @@ def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Ar
     return np.concatenate([np.full(lines.size, max(1.0, power[lines].mean() / channels)) for lines in blocks])
 
 
-def pruned(fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE) -> RecordFit:
-    """The fit without modes that noise explains, several together where noise explains them all."""
+def pruned(
+    fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE, many: float = 100.0
+) -> RecordFit:  # fmt: skip
+    """The fit without modes that noise explains, several together where noise explains them all.
+
+    Where likelihood falls by `many` times what noise explains, a mode had cancelled much of another one next to it:
+    then the two begin as one, too.
+    """
     while np.any(least := least_of(fit)):
-        fit = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
+        fewer = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
+        if fit.likelihood - fewer.likelihood > many * least_worth(fit.model):
+            one = refitted(fit, _next_to_others(fit, least), limits=limits, monitor=monitor)
+            fewer = max(fewer, one, key=lambda one: one.likelihood)
+        fit = fewer
     return fit
+
+
+def _next_to_others(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
+    """The parameters without some modes, (m,), the first of them as one with the nearest that stays."""
+    log, first, numbers = np.log(fit.parameters.modes.omega), int(np.argmax(gone)), np.arange(gone.size)
+    others = gone | (numbers >= fit.model.m - fit.static)
+    nearest = int(np.argmin(np.where(others, np.inf, np.abs(log - log[first]))))
+    same = np.isin(numbers, (first, nearest))
+    return as_one(fit, same, nearest).at(~gone[~same | (numbers == nearest)])
 
 
 def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, few: float = 100.0) -> RecordFit:

@@ -474,3 +474,19 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
 def without(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
     """Parameters of a fit without some modes, (m,)."""
     return fit.parameters.at(~gone)
+
+
+def as_one(fit: RecordFit, same: NDArray[np.bool_], number: int) -> Parameters:
+    """Parameters of a fit with one mode in place of several, (m,), at the place of that of a number.
+
+    It has their mean pole and the sum of their residues, as they may be large and cancel one another.
+    """
+    p = fit.parameters
+    several, modes, ends = p.modes.at(same), Modes(*(part.copy() for part in p.modes)), p.ends.copy()
+    u, s, vt = np.linalg.svd(several.phi @ several.gamma)
+    # A force weighs the mode: it answers by the squares of participations.
+    size = float(np.linalg.norm(several.gamma @ vt[0])) if fit.model.force else float(np.sqrt(s[0]))
+    modes.phi[:, number], modes.gamma[number] = u[:, 0] * s[0] / max(size, ROUND_OFF), vt[0] * size
+    modes.omega[number], modes.ratios[number] = (np.exp(np.mean(np.log(part))) for part in several[2:])
+    ends[number] = np.linalg.pinv(modes.phi[:, [number]]) @ several.phi @ ends[same]
+    return replace(p, modes=modes, ends=ends).at(~same | (np.arange(same.size) == number))

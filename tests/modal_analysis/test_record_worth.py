@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis import model_order
 from sysid.modal_analysis.first_modes import leads_to
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import units_of
@@ -13,6 +14,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_model import Run
 from sysid.modal_analysis.model_order import (
     joint_worth,
+    least_of,
     least_worth,
     peaks_of,
     pruned,
@@ -21,7 +23,7 @@ from sysid.modal_analysis.model_order import (
     worth,
 )
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
-from sysid.modal_analysis.record_fit import record_modes, refitted
+from sysid.modal_analysis.record_fit import ROUGH, as_one, record_modes, refitted
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths
@@ -189,3 +191,40 @@ def test_a_mode_that_its_neighbour_makes_look_worth_something_goes(seed, noise, 
     np.testing.assert_allclose(np.sort(fewer.parameters.modes.omega), omega, rtol=1e-3)
     assert fit.likelihood - fewer.likelihood < least_worth(fit.model)
     assert without_weak_modes(fewer, FitMonitor()) is fewer
+
+
+def test_a_mode_that_another_one_had_cancelled_becomes_one_with_it():
+    test, omega = two_runs(False, n=1)
+    right = record_modes(test, omega, np.full(3, 0.012))
+    right = refitted(right, right.parameters)
+    p = right.parameters
+    twice = p.at(np.array([0, 0, 1, 2]))  # of the first mode fifty times too much, and as much less of one next to it
+    twice.modes.phi[:, 0] *= 51
+    twice.modes.phi[:, 1] *= -50
+    twice.ends[0] = twice.ends[1]
+    one = as_one(replace(right, parameters=twice), np.array([True, True, False, False]), 1)
+    for found, expected in zip(one.modes[2:], p.modes[2:], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    for weights in (lambda q: q.modes.gamma, lambda q: q.ends):  # a shape and its participation share a factor
+        for k in range(3):
+            found, expected = (np.outer(q.modes.phi[:, k], weights(q)[k]) for q in (one, p))
+            np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_two_that_cancelled_each_other_begin_as_one_where_one_alone_leads_away(monkeypatch):
+    test, omega = two_runs(False, n=1)
+    split = record_modes(test, np.append(omega, 1.0001 * omega[2]), np.full(4, 0.012))
+    split = refitted(split, split.parameters, limits=ROUGH)
+    assert np.count_nonzero(least_of(split)) == 1  # noise explains one of them
+    starts = []
+
+    def leads_away(fit, start, **how):
+        starts.append(start)
+        found = refitted(fit, start, **how)
+        return replace(found, chi2=found.chi2 + 1e6) if len(starts) == 1 else found
+
+    monkeypatch.setattr(model_order, "refitted", leads_away)
+    fewer = pruned(split, FitMonitor())
+    assert len(starts) == 2 and starts[1].modes.omega.size == 3
+    np.testing.assert_allclose(np.sort(fewer.parameters.modes.omega), omega, rtol=1e-3)
+    assert split.likelihood - fewer.likelihood < least_worth(split.model)
