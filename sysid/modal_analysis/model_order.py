@@ -390,25 +390,25 @@ def pruned(
 ) -> RecordFit:  # fmt: skip
     """The fit without modes that noise explains, several together where noise explains them all.
 
-    Where likelihood falls by `many` times what noise explains, a mode had cancelled much of another one next to it:
-    then the two begin as one, too.
+    Where likelihood falls by `many` times what noise explains, a mode within the width of another one had cancelled
+    much of it: then the two begin as one, too.
     """
     while np.any(least := least_of(fit)):
         fewer = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
-        if fit.likelihood - fewer.likelihood > many * least_worth(fit.model):
-            one = refitted(fit, _next_to_others(fit, least), limits=limits, monitor=monitor)
-            fewer = max(fewer, one, key=lambda one: one.likelihood)
+        fell = fit.likelihood - fewer.likelihood > many * least_worth(fit.model)
+        if fell and (start := _with_one_as_another(fit, least)):
+            fewer = max(fewer, refitted(fit, start, limits=limits, monitor=monitor), key=lambda one: one.likelihood)
         fit = fewer
     return fit
 
 
-def _next_to_others(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters:
-    """The parameters without some modes, (m,), the first of them as one with the nearest that stays."""
-    log, first, numbers = np.log(fit.parameters.modes.omega), int(np.argmax(gone)), np.arange(gone.size)
-    others = gone | (numbers >= fit.model.m - fit.static)
-    nearest = int(np.argmin(np.where(others, np.inf, np.abs(log - log[first]))))
-    same = np.isin(numbers, (first, nearest))
-    return as_one(fit, same, nearest).at(~gone[~same | (numbers == nearest)])
+def _with_one_as_another(fit: RecordFit, gone: NDArray[np.bool_]) -> Parameters | None:
+    """The parameters without some modes, (m,), the first of them as one with the nearest that stays, within widths."""
+    modes, first, numbers = fit.parameters.modes, int(np.argmax(gone)), np.arange(gone.size)
+    apart = np.abs(np.log(modes.omega / modes.omega[first])) / (modes.ratios + modes.ratios[first])
+    nearest = int(np.argmin(np.where(gone | (numbers >= gone.size - fit.static), np.inf, apart)))
+    both = np.isin(numbers, (first, nearest))
+    return as_one(fit, both, nearest).at(~gone[~both | (numbers == nearest)]) if apart[nearest] < 1 else None
 
 
 def without_weak_modes(fit: RecordFit, monitor: FitMonitor, near: float = 2.0, few: float = 100.0) -> RecordFit:
