@@ -468,7 +468,8 @@ def _left_at(test: Measurement, clocks: NDArray[np.intp], delays: Array, beside:
         terms = records.basis(direct + 0j, records.driven)
         basis = orthonormal(functions._replace(shared=np.hstack([terms, functions.shared])))[0]
         for row, at in zip(found, delays, strict=True):
-            turn = np.exp(2j * np.pi * records.freq[records.line, None] * at[of_clock[some]])
+            each, which = np.unique(at, return_inverse=True)  # most often one of all clocks
+            turn = np.exp(2j * np.pi * records.freq[records.line, None] * each)[:, which[of_clock[some]]]
             turned: ComplexArray = (real[:, some] + 1j * imaginary[:, some]) * turn
             data = np.concatenate([turned.real, turned.imag]) + along[:, some]
             squares = np.sum(data**2, axis=0) - np.sum(basis.answers(data) ** 2, axis=0)
