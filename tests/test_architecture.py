@@ -80,7 +80,8 @@ CEILINGS = {
     # damping, headers as more programs write them (7, beside what was taken away); poles above the lines that settle
     # (33), couplings beside these (12), delays put back, gains in a bounded time (3), day numbers of spreadsheets (4);
     # and late channels told from weak modes beside strong ones, and settled before further modes (75);
-    # and laws by squares where less is missed, forces beside gains within tolerances (7), modes that cancelled, equal turns (36).
+    # and laws by squares where less is missed, forces beside gains within tolerances (7), modes that cancelled, equal
+    # turns (36).
     "lines": 49_665,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables; the first modes.
     "files": 194,
