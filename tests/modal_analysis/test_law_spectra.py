@@ -37,6 +37,11 @@ GAMMA = PHI.T @ np.ones(2)
 STEPS = 12  # of a sample
 
 
+def further(y, times, by):
+    """Numbers a step on, of so many times their slopes."""
+    return [one + times * other for one, other in zip(y, by, strict=True)]
+
+
 def moved(base, *, law=True, both=False, by_first=False):
     """Absolute accelerations by a Runge-Kutta method of fourth order, the base band-limited.
 
@@ -60,9 +65,6 @@ def moved(base, *, law=True, both=False, by_first=False):
     def slope(y, u):
         *first, level = slopes_of(0, y[0], y[1], u)
         return *first, *slopes_of(1, y[2], y[3], u, level if by_first else None)[:2]
-
-    def further(y, times, by):
-        return [one + times * other for one, other in zip(y, by, strict=True)]
 
     y, out = [0.0] * 4, []  # (q, v) of each mode
     for k in range(n - 1):
@@ -89,9 +91,6 @@ def rubbing(base, size=0.06, smooth=0.003):
         first, second = size * math.tanh((a * v + b * w) / smooth), size * math.tanh((c * v + d * w) / smooth)
         of_first = -loss[0] * v - rise[0] * q - a * first - c * second - u[0]
         return v, w, of_first, -loss[1] * w - rise[1] * r - b * first - d * second - u[1]
-
-    def further(y, times, by):
-        return [one + times * other for one, other in zip(y, by, strict=True)]
 
     y, out = [0.0] * 4, []
     for k in range(n - 1):
