@@ -106,10 +106,10 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
 def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, worse: float = 1.01) -> RecordFit:
     """The fit; where its model misses much of the records, and more than least squares of them do, these.
 
-    What a model misses passes for noise of the base, by which the modes then explain anything. Least squares go on from
-    the modes found, with the motion of the base as recorded; where these are worse than a rigid body, from poles that
-    are looked for anew. Runs stated to be at rest that were not are a mistake, which explains what is missed. Where the
-    base moves at few lines, as in a sine, squares would be those of these lines alone.
+    What a model misses passes for noise of the base, by which the modes then explain anything. Least squares begin at
+    the modes found, with the motion of the base as recorded, and at poles that are looked for anew, and the better end
+    is taken. Runs stated to be at rest that were not are a mistake, which explains what is missed. Where the base moves
+    at few lines, as in a sine, squares would be those of these lines alone.
     """
     left, whole = left_of(fit), fit.model.whole
     sound = fit.stopped or whole.noise is not None or not misses_much(left) or at_few_lines(fit.test)
@@ -119,9 +119,7 @@ def _no_worse_than_squares(fit: RecordFit, monitor: FitMonitor, worse: float = 1
     plain = replace(fit, test=replace(fit.test, whole=replace(whole, varying=None, plain=True)))
     first = replace(without(fit, np.arange(fit.model.m) >= fit.model.m - fit.static), coupling=None)  # no dampers
     try:
-        squares = refitted(plain, first, monitor=monitor, static=0)
-        if left > 1.0:
-            squares = min((squares, *_anew(plain, monitor)), key=left_of)
+        squares = min((refitted(plain, first, monitor=monitor, static=0), *_anew(plain, monitor)), key=left_of)
     except (Stop, KeyboardInterrupt):
         return replace(fit, stopped=True)
     return squares if left > worse * left_of(squares) and not runs_in_motion(fit) else fit
