@@ -159,12 +159,17 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
 
 
 def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
-    """The fit of as many modes at most, at those poles that the records need most; none where none stand out."""
+    """The fit of as many modes at most, at those poles that the records need most; none where none stand out.
+
+    Poles beyond the lines stand for what is there, and are not counted, as in spectra.
+    """
     try:
         poles = find_poles(fit.test, monitor=monitor)
     except (InputError, np.linalg.LinAlgError):
         return []
-    kept = strongest_poles(Records(fit.test), poles, fit.model.m, np.ones(poles.omega.size, bool))
+    first, last = 2 * np.pi * fit.test.freq[[0, -1]]
+    inside = (poles.omega >= first) & (poles.omega <= last)
+    kept = strongest_poles(Records(fit.test), poles, fit.model.m, inside)
     anew = record_modes(fit.test, poles.omega[kept], poles.ratios[kept], monitor=monitor)
     return [refitted(anew, anew.parameters, monitor=monitor)]
 
