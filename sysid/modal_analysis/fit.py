@@ -159,7 +159,7 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
 
 
 def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
-    """The fit of at most as many modes within the lines, at poles that the records need most; none where none stand out."""
+    """The fit of at most as many modes in the lines, at poles that the records need most; none where none stand out."""
     try:
         poles = find_poles(fit.test, monitor=monitor)
     except (InputError, np.linalg.LinAlgError):
