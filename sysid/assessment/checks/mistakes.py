@@ -337,7 +337,7 @@ def check_records(prepared: Prepared, clocks: Sequence[Clock], monitor: FitMonit
     """Mistakes that records show before a search, the worst first; nothing is prepared that no check asks for.
 
     Raises InputError where one spoils all channels, or a channel of a problem whose model has a form of its own, so
-    that a search would be in vain.
+    that a search would be in vain; Stop and KeyboardInterrupt of the monitor, where modes are fitted, pass through.
     """
     problem, declared = prepared.stated, prepared.stated.declared
     fitted = clocks[problem.misfit is not None :]
