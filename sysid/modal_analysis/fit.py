@@ -165,8 +165,8 @@ def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
     except (InputError, np.linalg.LinAlgError):
         return []
     first, last = 2 * np.pi * fit.test.freq[[0, -1]]
-    inside = (poles.omega >= first) & (poles.omega <= last)
-    kept = strongest_poles(Records(fit.test), poles, fit.model.m, inside)
+    inside, found = ((w >= first) & (w <= last) for w in (poles.omega, fit.parameters.modes.omega))
+    kept = strongest_poles(Records(fit.test), poles, np.count_nonzero(found), inside)
     anew = record_modes(fit.test, poles.omega[kept], poles.ratios[kept], monitor=monitor)
     return [refitted(anew, anew.parameters, monitor=monitor)]
 
