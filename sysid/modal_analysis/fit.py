@@ -166,7 +166,7 @@ def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
         return []
     first, last = 2 * np.pi * fit.test.freq[[0, -1]]
     inside, found = ((w >= first) & (w <= last) for w in (poles.omega, fit.parameters.modes.omega))
-    kept = strongest_poles(Records(fit.test), poles, np.count_nonzero(found), inside)
+    kept = strongest_poles(Records(fit.test), poles, max(1, int(found.sum())), inside)
     anew = record_modes(fit.test, poles.omega[kept], poles.ratios[kept], monitor=monitor)
     return [refitted(anew, anew.parameters, monitor=monitor)]
 
