@@ -203,9 +203,9 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
     try:
         other = (
             f"problem {path}: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes a test "
-            "of a logger's file, and 'sysid run TEST.h5' runs it"
+            "of a logger's file, 'sysid run TEST.h5' runs it, and 'sysid new NAME --data TEST.h5' makes a module of it"
         )
-        hint = "; 'sysid show' tells of a result" * (path / "result.h5").is_file()
+        hint = "; 'sysid show' tells of a result, 'sysid new' makes a problem" * (path / "result.h5").is_file()
         refuse(
             # A device, or a pipe, may never end; a test or a result that somebody else made may hold Python.
             (path.exists() and not path.is_file(), f"problem {path} is not a file{hint}"),

@@ -170,12 +170,12 @@ REFUSED = {
     ),
     "a folder of a result for a module": (
         lambda: (Path("kept").mkdir(), Path("kept/result.h5").touch(), catalogue.build(Recipe("kept/"))),
-        "problem kept is not a file; 'sysid show' tells of a result",
+        "problem kept is not a file; 'sysid show' tells of a result, 'sysid new' makes a problem",
     ),
     "a table for a module": (
         lambda: (Path("log.csv").touch(), catalogue.build(Recipe("log.csv"))),
         "problem log.csv: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes a test "
-        "of a logger's file, and 'sysid run TEST.h5' runs it",
+        "of a logger's file, 'sysid run TEST.h5' runs it, and 'sysid new NAME --data TEST.h5' makes a module of it",
     ),
     "sensors in single brackets": (
         lambda: (Path("s.toml").write_text("[sensor]\nname='a'\n[sensor]"), description.from_toml(Path("s.toml"))),
@@ -189,7 +189,8 @@ REFUSED = {
     "a test for a module": (
         lambda: catalogue.build(Recipe("./test.h5")),
         "problem test.h5: the name of a problem module ends in .py; 'sysid read FILE --out TEST.h5' makes "
-        "a test of a logger's file, and 'sysid run TEST.h5' runs it",
+        "a test of a logger's file, 'sysid run TEST.h5' runs it, and 'sysid new NAME --data TEST.h5' makes a module "
+        "of it",
     ),
     "no data": (
         lambda: catalogue.build(Recipe("idle.py", "nowhere")),

@@ -183,11 +183,11 @@ def _add_test_options(run: argparse.ArgumentParser) -> None:
         "time, unless given",
     )  # fmt: skip
     run.add_argument(
-        "--goal", type=float, metavar="SHARE",
+        "--goal", type=_share, metavar="SHARE",
         help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
     )  # fmt: skip
     run.add_argument(
-        "--gain-std", type=float, metavar="SHARE",
+        "--gain-std", type=_share, metavar="SHARE",
         help="of TEST.h5: tolerance of the gains of all channels, base and force included, as a standard deviation, "
         "such as 0.005; those that the sensors' list states, exact where it states none",
     )  # fmt: skip
@@ -408,6 +408,14 @@ def _band(text: str) -> tuple[float, float]:
     if not 0 <= ends[0] < ends[1] < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no band: write its ends in Hz, such as 0.5-20")
     return ends
+
+
+def _share(text: str) -> float:
+    """A share, which is no per cent."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no share: 0.005 is half a per cent") from None
 
 
 def _orders(text: str) -> tuple[int, int]:

@@ -328,19 +328,18 @@ def sensor_table(it: Identification) -> str:
     """The gain of each sensor as the records show it, and its delay."""
     found = tables.gains_of_sensors(it)
     priced = it.determined and any(g.worth > 0 for g in found)  # else M_SS has no deviation, or was stated
-    late, within = any(g.delay for g in found), it.modal[0].calibration is not None
+    late, within = any(g.delay for g in found), any(g.within for g in found)
     caption = (
-        "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses assume 1. "
-        "±: half of the 95 % interval."
-        + " What is likely within stated tolerances was taken off, and the intervals of M, K and C hold the rest."
-        * within
+        "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses assume 1"
+        + ", what is likely within stated tolerances taken off; intervals of M, K and C hold the rest" * within
+        + ". ±: half of the 95 % interval."
         + " Delay: by which the records were late; it was taken off." * late
         + " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off." * priced
     )
-    head = ("sensor", "gain", "±", *["delay, ms", "±"] * late, *["1 % moves M_SS by, deviations"] * priced)
+    columns = *["taken off"] * within, *["delay, ms", "±"] * late, *["1 % moves M_SS by, deviations"] * priced
     delays = [rounded(1e3 * g.delay, 1e3 * g.delay_std) * late for g in found]
     rows = [
-        (g.sensor, *rounded(g.gain, g.std), *delay, *[number(g.worth, 2)] * priced)
+        (g.sensor, *rounded(g.gain, g.std), *[f"{1 + g.within:.4f}"] * within, *delay, *[number(g.worth, 2)] * priced)
         for g, delay in zip(found, delays, strict=True)
     ]
-    return table(head, rows, caption)
+    return table(("sensor", "gain", "±", *columns), rows, caption)

@@ -94,11 +94,15 @@ def _noise(it: Answer) -> list[str]:
 
 def _gains(it: Answer) -> list[str]:
     """Table of each sensor's gain as the records show it."""
+    found = tables.gains_of_sensors(it)
+    within = any(g.within for g in found)
     rows = [
-        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
-        for g in tables.gains_of_sensors(it)
-    ]
-    head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")
+        (g.sensor, f"{g.gain:.4f}", tables.half_width(g.std, g.gain), *[f"{1 + g.within:.4f}"] * within,
+         "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
+        for g in found
+    ]  # fmt: skip
+    first = "gain against the base" + " (M assumes 1)" * (not within)
+    head = (first, "by the records", "+- (95 %)", *["taken off"] * within, "1 % moves M_SS by, deviations")
     return _table(head, rows)
 
 
@@ -200,9 +204,10 @@ def _mode_table(it: Answer) -> list[str]:
     s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
     std, many = tables.mass_percent_std(it), tables.is_one_of_many(it)
     shares, k = s.effective_mass_percent, range(s.n)
+    f_std = np.full(s.n, np.nan) if u is None else u.natural_frequencies
     columns = [
         ["mode", *(f"{i + 1}" for i in k), "sum"],
-        ["frequency, Hz", *(f"{f:.5g}" for f in s.natural_frequencies), ""],
+        ["frequency, Hz", *map(tables.as_known, s.natural_frequencies, f_std), ""],
         ["damping, %", *("-" if np.isnan(zeta) else f"{100 * zeta:.4g}" for zeta in it.identified_ratios), ""],
     ]
     if u is not None:

@@ -66,7 +66,8 @@ class SensorGain(NamedTuple):
     """Gain of a sensor against the base's, its standard deviation, and what 1 % of it does to M_SS.
 
     `worth` is in stated deviations of the diagonal entry that moves by most of them; NaN where there is no noise.
-    `delay`, s, was taken off; zero where it is on the base's clock.
+    `delay`, s, was taken off; zero where it is on the base's clock. So was `within`, the relative error that is likely
+    within stated tolerances.
     """
 
     sensor: str
@@ -75,6 +76,7 @@ class SensorGain(NamedTuple):
     worth: float
     delay: float = 0.0
     delay_std: float = 0.0
+    within: float = 0.0
 
     def to_tree(self) -> dict[str, str | float]:
         """Give the fields by their names, but for what it is worth."""
@@ -88,11 +90,10 @@ def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
     found, names = it.gains, it.measurement.sensor_names
     known = np.isfinite(found.error)
     worth = np.where(np.nan_to_num(found.std) > EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
-    late = it.modal[0].delays or Delays.none(it.measurement)
-    return tuple(
-        SensorGain(names[i], *(float(one[i]) for one in (1 + found.error, found.std, worth, late.values, late.std)))
-        for i in np.flatnonzero(known)
-    )
+    late, stated = it.modal[0].delays or Delays.none(it.measurement), it.modal[0].calibration
+    within = np.zeros(known.size) if stated is None else stated.seen(it.measurement)
+    columns = (1 + found.error, found.std, worth, late.values, late.std, within)
+    return tuple(SensorGain(names[i], *(float(one[i]) for one in columns)) for i in np.flatnonzero(known))
 
 
 class ChannelNoise(NamedTuple):
@@ -194,6 +195,14 @@ def half_width(std: float, value: float) -> str:
     if not np.isfinite(std):
         return "open"
     return f"{LIKELY * std:.2g}" if std > ROUND_OFF * abs(value) else "0"
+
+
+def as_known(value: float, std: float, digits: int = 5) -> str:
+    """A value to two digits of half of its 95 % interval, and to so many digits at least."""
+    if value and np.isfinite(std) and std > ROUND_OFF * abs(value):
+        first, last = np.floor(np.log10((abs(value), LIKELY * std)))
+        digits = max(digits, int(first - last) + 2)
+    return f"{value:.{digits}g}"
 
 
 def known_half_width(std: float, value: float, sign: str) -> str:

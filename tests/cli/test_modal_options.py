@@ -1,6 +1,7 @@
 """``--modes`` and ``--dofs``: so many modes, on these sensors, of a run, of jobs about its result, and side by side."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,10 +42,15 @@ def test_tolerances_of_all_gains_at_the_command_line(folder, file, capsys):
     assert result.modal[0].calibration.tolerance.tolist() == [0.004] * 5
     least = 0.004 * np.diag(result.structure.mass)[: result.structure.n]  # of the force's gain alone
     assert np.all(np.diag(result.uncertainty.mass) > least)
-    capsys.readouterr()
-    assert cli.main(["run", file, "--gain-std", "5"]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "gain_std" in told
+    within = result.modal[0].calibration.seen(result.measurement)
+    told = capsys.readouterr().out
+    assert all(f"{1 + one:.4f}  " in told for one in within) and "taken off" in told and "assumes" not in told
+    kept = json.loads(Path("within/summary.json").read_text(encoding="utf-8"))
+    assert [one["within"] for one in kept["gains"]] == pytest.approx(within)
+    for wrong, why in (("5", "gain_std"), ("0.5%", "0.005 is half a per cent")):
+        assert cli.main(["run", file, "--gain-std", wrong]) == 2
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and why in told
 
 
 @pytest.fixture

@@ -59,7 +59,8 @@ def test_the_table_of_modes_has_half_of_each_95_percent_interval(modal):
     u, s = it.uncertainty, it.structure
     percent = 100 / np.diag(s.rigid_body_mass)
     for k, row in enumerate(rows(it)[1:4]):
-        assert row[:3] == [str(k + 1), f"{s.natural_frequencies[k]:.5g}", half(u.natural_frequencies[k])]
+        assert row[::2][:2] == [str(k + 1), half(u.natural_frequencies[k])]
+        assert abs(float(row[1]) - s.natural_frequencies[k]) < 0.051 * float(row[2])  # to the digits of its interval
         assert row[3:5] == [f"{100 * s.damping_ratios[k]:.4g}", half(100 * u.damping_ratios[k])]
         for i in range(2):
             mass, std = percent[i] * s.effective_masses[k, i, i], percent[i] * u.effective_masses[k, i, i]
