@@ -413,9 +413,12 @@ def _band(text: str) -> tuple[float, float]:
 def _share(text: str) -> float:
     """A share, which is no per cent."""
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no share: 0.005 is half a per cent") from None
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no share: 0.005 is half a per cent")
+    return value
 
 
 def _orders(text: str) -> tuple[int, int]:

@@ -208,6 +208,7 @@ class Identification(Answer):
             "unknown_units": {v.name: v.unit for v in reported},
             **self._in_band(),
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
+            "total_mass_std_kg": _plain(np.diag(self.quick_std("rigid_body_mass"))),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),

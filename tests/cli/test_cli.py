@@ -24,9 +24,9 @@ pytestmark = pytest.mark.usefixtures("from_one_start_in_module")
 FREQUENCIES = "truth.natural_frequencies"
 KEYS = {
     "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",
-    "total_mass_kg", "determined", "evaluations", "wall_time_s", "version", "natural_frequencies_std_hz",
-    "damping_ratios_std", "findings", "judgement", "confidence", "objective", "residuals", "unknowns", "unknowns_std",
-    "unknown_units",
+    "total_mass_kg", "total_mass_std_kg", "determined", "evaluations", "wall_time_s", "version",
+    "natural_frequencies_std_hz", "damping_ratios_std", "findings", "judgement", "confidence", "objective",
+    "residuals", "unknowns", "unknowns_std", "unknown_units",
 }  # fmt: skip
 
 

@@ -47,7 +47,8 @@ def test_tolerances_of_all_gains_at_the_command_line(folder, file, capsys):
     assert all(f"{1 + one:.4f}  " in told for one in within) and "taken off" in told and "assumes" not in told
     kept = json.loads(Path("within/summary.json").read_text(encoding="utf-8"))
     assert [one["within"] for one in kept["gains"]] == pytest.approx(within)
-    for wrong, why in (("5", "gain_std"), ("0.5%", "0.005 is half a per cent")):
+    assert kept["total_mass_std_kg"] == np.diag(result.uncertainty.rigid_body_mass).tolist()
+    for wrong, why in (("5", "gain_std"), ("0.5%", "0.005 is half a per cent"), ("nan", "0.005 is half a per cent")):
         assert cli.main(["run", file, "--gain-std", wrong]) == 2
         told = capsys.readouterr().err
         assert told.count("\n") == 1 and why in told
