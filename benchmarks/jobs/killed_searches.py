@@ -22,7 +22,7 @@ BESIDE = 2  # searches at a time; these threads only wait for processes
 def lines(reduced: bool) -> Iterator[Line]:
     """Of kills spread over the whole search: the results with the right bits, all cases together."""
     rng = np.random.default_rng(11)
-    kills = 3 if reduced else KILLS
+    kills = len(searches.CASES) if reduced else KILLS
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(BESIDE) as pool:
         ends = pool.map(lambda case: _whole(case, Path(folder) / case), searches.CASES)
         whole = dict(zip(searches.CASES, ends, strict=True))

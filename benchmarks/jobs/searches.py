@@ -13,7 +13,7 @@ from sysid import catalogue
 from sysid.files.tree import from_bytes
 from sysid.results.checkpoint import Checkpoint
 
-CASES = ("swarm", "swarm of free modes", "continuation")
+CASES = ("swarm", "swarm of free modes", "continuation", "law of amplitude")
 STATE, RESULT = "state.h5", "result.h5"
 EVERY = 0.05  # s between two states
 
@@ -23,6 +23,8 @@ def main(case: str, folder: str) -> None:
     if case == "swarm of free modes":
         recipe = sysid.Recipe("cantilever_tower", parameters={"elements": 3, "noise": 0.0, "force": False})
         problem, strategy = catalogue.build(recipe), sysid.Swarm.published()
+    elif case == "law of amplitude":
+        problem, strategy = catalogue.build(sysid.Recipe("softening_storey")), "auto"
     else:
         problem = problem_of(STRUCTURED[0], 9400)[0]
         strategy = sysid.Swarm(60) if case == "swarm" else sysid.Continuation(starts=3)
