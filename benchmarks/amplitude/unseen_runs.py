@@ -41,7 +41,8 @@ def lines(reduced: bool) -> Iterator[Line]:
             f"times the noise: share missed at most half as much as by it (largest {max(predicted):.2g})",
             float(np.mean(np.array(predicted) <= 0.5)), 0.95,
         )  # fmt: skip
-        more = [f"{KINDS[seed % 5]} {seed}: {one.ratio:.2f}" for seed, one in enumerate(found) if (one.ratio or 0) > 0.5]
+        ratios = [(f"{KINDS[seed % 5]} {seed}", one.ratio or 0.0) for seed, one in enumerate(found)]
+        more = [f"{name}: {ratio:.2f}" for name, ratio in ratios if ratio > 0.5]
         yield Line("of these, missed more than half as much", ", ".join(more) or "none")
     within = float(np.mean([one.off <= 1 for one in found]))
     yield above(
