@@ -8,7 +8,8 @@
 # 2. what all such structures have in common, and how few numbers tell them apart;
 # 3. which knowledge closes the question: a total mass, weighed floors, a lumped mass, a measured base force;
 # 4. the difference between an *interval* (what the data leave open) and an *uncertainty* (what noise does);
-# 5. a mode that the base does not move.
+# 5. a mode that the base does not move;
+# 6. damping that couples the modes, which only weighed modes show whole.
 #
 # Every example has two degrees of freedom, so that it fits into a picture. Nothing here depends on sysid's way of
 # computing: it holds for every method that uses the same records.
@@ -323,7 +324,38 @@ plt.show()
 # measured, and not better. If a weak mode matters, shake in another direction, or excite it by other means. These
 # intervals are first-order ones: for a mode that the result calls "not weighed" read its sentence, not its interval.
 #
+# ## Damping that couples modes
+#
+# A dashpot between the two floors of the first frame takes energy out of both modes at once: $\Phi^T C \Phi$ is no
+# longer diagonal, and no damping ratios hold it. With the base force C is found whole beside M and K, with the standard
+# deviation of each entry.
+
+# %%
+apart = np.array([1.0, -1.0])  # what the dashpot sees of the floors
+C = frame.damping + 500.0 * np.outer(apart, apart)  # N s/m
+damped = sysid.Structure(frame.mass, frame.stiffness, damping_matrix=C, n_base=1)
+lines = np.linspace(2.0, 14.0, 400)
+test = sysid.simulate(damped, lines, noise=0.01, force=True, rng=0)
+weighed = sysid.identify(sysid.Problem(test), rng=0)
+print(f"with the force: {weighed.judgement}; C, its standard deviations, and the true one, N s/m:")
+print(np.hstack([weighed.structure.damping, weighed.uncertainty.damping, C]).round(1))
+(told,) = (one for one in weighed.findings if one.kind == "damping")
+print(f"dampers couple the modes by {told.numbers['share']:.1%} of the response")
+assert weighed.determined
+
+# %% [markdown]
+# From accelerations alone the scale of each mode is open, and what couples two modes depends on the scale of both. The
+# fit has damping ratios only. It says so, and what they miss:
+
+# %%
+alone = sysid.identify(sysid.Problem(sysid.simulate(damped, lines, noise=0.01, rng=0)), rng=0)
+print(f"without the force: {alone.judgement}", *alone.undetermined, sep="\n  - ")
+assert not alone.success
+
+# %% [markdown]
 # ## In short
+#
+# Damping is meant as ratios. C of dampers that couple modes is known where the base force is recorded.
 #
 # | you have | frequencies, damping, transmissibility | M and K |
 # |---|---|---|
