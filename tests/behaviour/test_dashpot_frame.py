@@ -1,6 +1,7 @@
 """The problem of a frame with a dashpot between floors, against its truth and beside the frame without it."""
 
 import numpy as np
+import pytest
 
 import sysid
 from sysid import catalogue
@@ -33,3 +34,8 @@ def test_without_the_dashpot_the_modes_are_classical_and_so_is_what_is_told():
     assert result.judgement == "determined"
     assert result.structure.modal_damping
     assert not any(one.kind == "damping" for one in result.findings)
+
+
+def test_it_takes_no_records(tmp_path):
+    with pytest.raises(sysid.InputError, match="dashpot_frame is simulated"):
+        catalogue.build(sysid.Recipe("dashpot_frame", str(tmp_path)))
