@@ -87,7 +87,8 @@ def _stages(
         else:
             left_out.append(law)
             yield replace(best if others and not hidden else fit, left_out=tuple(left_out))
-        if stated.modes == "auto" and not best.parameters.laws:
+        none_left = not np.any(_without_law(best))  # where others became one with a mode that has a law
+        if none_left or (stated.modes == "auto" and not best.parameters.laws):
             break
     if plain and best.parameters.laws:
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
@@ -227,14 +228,18 @@ def _beginnings(fit: RecordFit, omega: float, monitor: FitMonitor) -> list[tuple
 
     Where it shows at several levels, first with all these as one mode.
     """
-    p, numbers = fit.parameters, np.arange(fit.model.m)
-    free = ~np.isin(numbers, [law.mode for law in p.laws])
+    p, free = fit.parameters, _without_law(fit)
     k = int(np.argmin(np.where(free, np.abs(p.modes.omega - omega), np.inf)))
     like = free & _like(p.modes, k)
     if np.count_nonzero(like) == 1:
         return [(fit, k)]
     once = refitted(fit, as_one(fit, like, k), limits=ROUGH, monitor=monitor)
     return [(once, int(np.count_nonzero(~like[:k]))), (fit, k)]
+
+
+def _without_law(fit: RecordFit) -> NDArray[np.bool_]:
+    """True of modes that have no law yet, (m,)."""
+    return ~np.isin(np.arange(fit.model.m), [law.mode for law in fit.parameters.laws])
 
 
 def _started(

@@ -246,6 +246,16 @@ def test_a_mode_that_shows_at_several_levels_has_one_law(test):
     assert np.all(np.abs(away) < 5 * np.sqrt(np.diag(law.covariance)))
 
 
+def test_where_all_modes_left_have_a_law_none_is_looked_for(monkeypatch):
+    """As where a mode of its own in the linear fit becomes one with its neighbour."""
+    test = test_of((0.3, 3.0), both=True, samples=900)
+    fit = record_modes(test, OMEGA[[0, 0, 1]] * [0.95, 1.0, 1.0], RATIOS[[0, 0, 1]])
+    monkeypatch.setattr("sysid.modal_analysis.amplitude_fit._modes_of", lambda fit, stated: [0, 1, 2])
+    found = with_laws(fit, sysid.AmplitudeLaw(exponents=(0.5, 1.0)), monitor=FitMonitor())
+    assert found.model.m == 2
+    assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0, 8.0], rel=0.05)
+
+
 def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
     """One mode has a law; the other, linear and a tenth above, moves the sensors alike, as a tuned mass makes it."""
     w, beside = 2 * np.pi * test.freq, 2 * np.pi * 3.3
