@@ -87,6 +87,7 @@ BENCHMARKS = (
     ),
     Benchmark("swarm.spacecraft", "successes and seconds of the swarm strategy on the spacecraft", "7 min", "90 s"),
     Benchmark("swarm.shake_table", "measured records: fit of one event, prediction of another", "5 s", "5 s"),
+    Benchmark("amplitude.gradients", "gradients of fits with laws of amplitude", "1 min", "10 s"),
     Benchmark("amplitude.law_speed", "processor time of a law of three floors", "3 min", "15 s", timed=True),
     Benchmark("amplitude.measured_events", "measured records: a mode that follows its amplitude", "3 min", "25 s"),
     Benchmark("amplitude.stopped_laws", "laws of amplitude whose fit is stopped at random times", "4 min", "15 s"),
