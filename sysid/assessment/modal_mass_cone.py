@@ -375,6 +375,7 @@ def _unseen(
     if 2 * test.response.size < count:
         yield f"{2 * test.response.size} measured numbers cannot fix {count} unknowns"
     forces = _forces(problem.modal[0], structure)
+    moved_within = [law.mode for law in structure.laws if law.reaches(*test.freq[[0, -1]])]
     for k in range(structure.n):
         f, push = structure.natural_frequencies[k], structure.participation[[k]]
         (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
@@ -386,7 +387,7 @@ def _unseen(
                 f"what the fit misses ({100 * responses.misfit:.3g} % of the response) can look like a mode that makes "
                 f"up to {100 * responses.level:.3g} %"
             )
-        elif not test.freq[0] <= f <= test.freq[-1]:
+        elif not (test.freq[0] <= f <= test.freq[-1] or k in moved_within):
             yield (
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 f"answers for all modes there{_like_rigid(test, structure, k)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session, TimeIsOver, within
 from sysid.search.stated_masses import positive_part, to_stated_totals
 from sysid.search.strategy import Outcome
+from sysid.structure.amplitude import FittedLaw
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
 
@@ -47,12 +48,20 @@ class Verdict(NamedTuple):
     message: str
 
 
+def _of_its_modes(laws: Sequence[FittedLaw], structure: Structure) -> list[FittedLaw]:
+    """Those laws whose modes a structure has, one of each mode."""
+    f = structure.natural_frequencies
+    modes = {law.mode_among(f): law for law in laws if law.mode_among(f, followed=True) is not None}
+    return [law for mode, law in modes.items() if mode is not None]
+
+
 def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     try:
         end = replace(end, structure=end.structure.with_laws(prepared.laws))
     except InputError as error:
         left_out = f"laws of amplitude are left out of the structure: {error}"
+        end = replace(end, structure=end.structure.with_laws(_of_its_modes(prepared.laws, end.structure)))
         end = replace(end, findings=(*end.findings, Finding("amplitude open", Severity.CAUTION, left_out)))
     context = Context(prepared, end, session.cut_short)
     verdict = verdict_of(context)

@@ -159,6 +159,11 @@ class FittedLaw:
         w, zeta = self.form.at(ca.SX(level), ca.SX(self.frequency), ca.SX(self.ratio), ca.SX(ca.DM(self.values)))
         return float(w), float(zeta)
 
+    def reaches(self, low: float, high: float) -> bool:
+        """True where the mode is between two frequencies, Hz, at some of the levels that it moved at."""
+        ends = [self.at(level)[0] for level in self.levels]
+        return min(ends) <= high and max(ends) >= low
+
     def changes_at(self, level: float, omega: float, ratio: float) -> tuple[float, float]:
         """``w² - w0²`` and ``2 (zeta w - zeta0 w0)`` at a level, of a mode of `omega`, rad/s, and `ratio` at rest."""
         frequency, damping = self.at(level)

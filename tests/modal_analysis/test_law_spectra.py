@@ -28,6 +28,7 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.misfit import left_of
 from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
+from sysid.results.judgement import _of_its_modes
 from sysid.structure.amplitude import LawForm
 
 RATE, FALL, RISE, LEVEL = 40.0, 0.06, 0.012, 12.0
@@ -301,6 +302,24 @@ def test_noise_of_the_base_does_not_stand_for_what_laws_of_friction_miss():
     assert left_of(found) < 0.2 * left_of(linear)
     assert found.parameters.modes.omega[0] == pytest.approx(OMEGA[0], rel=2e-4)  # 4e-4 and more beside that noise
     assert found.parameters.modes.ratios[0] == pytest.approx(RATIOS[0], rel=0.01)
+
+
+def test_a_mode_above_the_lines_at_rest_that_moves_within_them_keeps_its_law():
+    """The second mode is at 8 Hz at rest, and 7 % lower at the levels of the test; lines end between."""
+    test = test_of((0.3, 3.0), both=True, samples=900).in_band(0.8, 7.93)
+    answer = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(1.0, 1.0))), rng=0)
+    assert answer.structure.natural_frequencies[1] > test.freq[-1]
+    assert [law.mode for law in answer.structure.laws] == [0, 1]
+    base = shaken(1.0, 77)
+    missed = answer.structure.simulate(base[None], RATE) - moved(base, both=True)
+    assert np.linalg.norm(missed) < 0.25 * np.linalg.norm(moved(base, both=True) - base)  # 0.7 without laws
+
+
+def test_a_law_whose_mode_the_structure_has_not_takes_no_other_with_it(answer):
+    (law,) = answer.structure.laws
+    lost = replace(law, frequency=20.0)
+    assert _of_its_modes([lost, law], answer.structure) == [law]
+    assert _of_its_modes([replace(law, followed=20.0)], answer.structure) == []
 
 
 def test_laws_that_were_left_out_stay_where_the_fit_goes_on(answer, monkeypatch):
