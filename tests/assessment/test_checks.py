@@ -270,6 +270,21 @@ class TestTwins:
         assert found.structure.n == 3
         assert [one.channel for one in found.of_kind("one motion")] == ["sensor 3"] * count
 
+    def test_one_that_is_no_degree_of_freedom_does_no_harm(self):
+        """Three modes and three sensors, two of them in one motion: a modal coordinate stands in the place of one."""
+        truth = modal_twin(building())
+        recovery = np.eye(3)[[1, 2, 2]]
+        wide = Structure(
+            truth.mass, truth.stiffness, truth.damping_ratios, n_base=1, recovery=recovery,
+            rigid_body=recovery @ truth.rigid_body,
+        )  # fmt: skip
+        test = simulate(wide, lines(truth), noise=0.001, force=True, rng=3)
+        found = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert found.structure.n == 3
+        assert sorted(found.structure.dof_sensors) in ([-1, 0, 1], [-1, 0, 2])
+        assert [one.severity for one in found.of_kind("one motion")] == ["note"]
+        assert found.determined
+
     def test_nor_are_sensors_that_both_record_nothing_but_noise(self):
         test, structure = self.with_twin(1, 0.001)
         rng = np.random.default_rng(0)
