@@ -271,9 +271,9 @@ class TestTwins:
         assert [one.channel for one in found.of_kind("one motion")] == ["sensor 3"] * count
 
     def test_one_that_is_no_degree_of_freedom_does_no_harm(self):
-        """Three modes and three sensors, two of them in one motion: a modal coordinate stands in the place of one."""
+        """Three modes, two sensors in one motion: with fewer sensors than modes there are modal coordinates anyway."""
         truth = modal_twin(building())
-        recovery = np.eye(3)[[1, 2, 2]]
+        recovery = np.eye(3)[[2, 2]]
         wide = Structure(
             truth.mass, truth.stiffness, truth.damping_ratios, n_base=1, recovery=recovery,
             rigid_body=recovery @ truth.rigid_body,
@@ -281,7 +281,7 @@ class TestTwins:
         test = simulate(wide, lines(truth), noise=0.001, force=True, rng=3)
         found = sysid.identify(Problem(test, mass=FullMass()), rng=0)
         assert found.structure.n == 3
-        assert sorted(found.structure.dof_sensors) in ([-1, 0, 1], [-1, 0, 2])
+        assert np.count_nonzero(found.structure.dof_sensors >= 0) == 1
         assert [one.severity for one in found.of_kind("one motion")] == ["note"]
         assert found.determined
 

@@ -248,8 +248,8 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
         both = each + (EXACT**2 * (size[i] + size[j])) / lines.sum()
         apart = np.mean(np.abs(moves[i] - sign * moves[j]) ** 2 / both)
         if apart <= most and np.mean(np.abs(moves[[i, j]]) ** 2 / both, axis=1).min() > _SEEN**2:
-            # Of more sensors than move apart some are no degrees of freedom, and no harm is done.
-            spare = not np.isin([i, j], structure.dof_sensors).all()
+            # Of more sensors than modes, or fewer, one of both is no degree of freedom, and no harm is done.
+            spare = structure.n != test.n_sensors and not np.isin([i, j], structure.dof_sensors).all()
             yield Finding(
                 "one motion", Severity.NOTE if spare else Severity.CONTRADICTS,
                 f"sensors {names[j]} and {names[i]} record one motion but for noise"
