@@ -264,15 +264,15 @@ class Prepared(SearchSpace):
     def of_structure(self, omega: Array) -> NDArray[np.bool_]:
         """True for modes of the structure, by their frequencies, rad/s, (m,): see `answers_in_band`.
 
-        They are those within the lines, or those that stand for stated frequencies; with a law of amplitude those that
-        are within the lines at some level that they moved at.
+        They are those that stand for stated frequencies, or, without any, those within the lines: with a law of
+        amplitude, at some level that they moved at.
         """
         if not self.answers_in_band:
             return np.ones(omega.size, bool)
         lines, stated = self.measurement.freq[[0, -1]], 2 * np.pi * self.stated.frequencies
         # A stated frequency may be off by the window, and a fit may move by it.
         inside = modes_within(omega, 2 * np.pi * lines, stated, 2 * FREQUENCY_WINDOW)
-        followed = [law.mode_among(omega / (2 * np.pi)) for law in self.laws if law.reaches(*lines)]
+        followed = [law.mode_among(omega / (2 * np.pi)) for law in self.laws if law.reaches(*lines) and not stated.size]
         inside[[mode for mode in followed if mode is not None]] = True
         return inside
 

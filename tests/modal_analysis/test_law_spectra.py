@@ -315,6 +315,16 @@ def test_a_mode_above_the_lines_at_rest_that_moves_within_them_keeps_its_law():
     assert np.linalg.norm(missed) < 0.25 * np.linalg.norm(moved(base, both=True) - base)  # 0.7 without laws
 
 
+def test_of_modes_with_laws_those_that_are_stated_are_the_structure_s():
+    """Both modes follow their amplitude, and one frequency is stated: the other mode's law takes none with it."""
+    stated = sysid.SpectralStiffness([2.9])
+    asked = sysid.AmplitudeLaw(exponents=(1.0, 1.0))
+    test = test_of((0.3, 3.0), both=True, samples=900)
+    answer = sysid.identify(sysid.Problem(test, stiffness=stated, amplitude=asked), rng=0)
+    assert answer.structure.natural_frequencies == pytest.approx([2.93], rel=0.01)
+    assert [law.mode for law in answer.structure.laws] == [0]
+
+
 def test_a_law_whose_mode_the_structure_has_not_takes_no_other_with_it(answer):
     (law,) = answer.structure.laws
     lost = replace(law, frequency=20.0)
