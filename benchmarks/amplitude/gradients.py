@@ -33,9 +33,8 @@ def lines(reduced: bool) -> Iterator[Line]:
         slopes = np.diag(model.normal_equations(model.unpack(at), fit.levels).normal)
         return np.where(free, size * rng.standard_normal(at.size) / np.sqrt(np.where(free, slopes, 1.0)), 0.0)
 
-    worst = 0.0
+    worst, answer = 0.0, model.pack(fit.parameters)
     for _ in range(5):
-        answer = model.pack(fit.parameters)
         point = answer + step_of(answer, 3.0)
         gradient = -2 * model.gradient(model.unpack(point), fit.levels).gradient
         for _ in range(5):
