@@ -31,7 +31,7 @@ class LawMotions:
     Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for.
     """
 
-    def __init__(self, test: Measurement, per_period: float = 24.0) -> None:
+    def __init__(self, test: Measurement, per_period: float = 16.0) -> None:
         self.per_period = per_period
         self.rate, self.samples, self.at_rest = _clock_of(test)
         self.lines = [test.freq[lines] for lines in test.own_lines]

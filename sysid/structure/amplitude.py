@@ -192,16 +192,17 @@ class FittedLaw:
 
 
 @functools.cache
-def _functions(form: LawForm) -> tuple[ca.Function, ca.Function]:
+def _functions(form: LawForm, given: int = 0) -> tuple[ca.Function, ca.Function]:
     """First state and one step of the motion of a mode, under a load that is linear between samples.
 
-    The numbers of the mode are ``(log w0, log zeta0, log size, law)``; a state is ``(q, q', A)``. A step has the
-    frequency and damping of the level at its beginning, which is that of the acceleration by the frequency of the step
-    before: the law itself lowers the level that it is of. The first function takes ``(q, q')`` and these numbers. The
-    second takes a state, the load at both ends of the step, its length and these numbers, and gives the next state and
-    ``-2 zeta w q' - w² q`` at its beginning.
+    The numbers of the mode are ``(log w0, log zeta0, log size, law)``; a state is ``(q, q', A)``, A that of the
+    acceleration by the frequency of the level before: the law itself lowers the level that it is of. A step has the
+    frequency and damping of the mean of the levels at both ends, the last one `given` or by a step as at the beginning.
+    The first function takes ``(q, q')`` and these numbers. The second takes a state, the load at both ends of the step,
+    the `given` level, its length and these numbers, and gives the next state and ``-2 zeta w q' - w² q`` at its
+    beginning.
     """
-    p, h = ca.SX.sym("p", 3 + form.size), ca.SX.sym("h")
+    p, h, end = ca.SX.sym("p", 3 + form.size), ca.SX.sym("h"), ca.SX.sym("A", given)
     omega, ratio, size = ca.exp(p[0]), ca.exp(p[1]), ca.exp(p[2])
 
     def level(q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
@@ -214,9 +215,11 @@ def _functions(form: LawForm) -> tuple[ca.Function, ca.Function]:
     first = ca.Function("first", [begin, p], [ca.vertcat(begin, level(begin[0], begin[1], w))])
     state, load = ca.SX.sym("z", 3), ca.SX.sym("u", 2)
     w, zeta = form.at(state[2], omega, ratio, p[3:])
-    q, v = _step(state, load[0], load[1], h, w, zeta)
+    near = end if given else level(*_step(state, load[0], load[1], h, w, zeta), w)
+    q, v = _step(state, load[0], load[1], h, *form.at((state[2] + near) / 2, omega, ratio, p[3:]))
+    last = end if given else level(q, v, form.at(near, omega, ratio, p[3:])[0])
     restoring = -2 * zeta * w * state[1] - w**2 * state[0]
-    step = ca.Function("step", [state, load, h, p], [ca.vertcat(q, v, level(q, v, w)), restoring])
+    step = ca.Function("step", [state, load, end, h, p], [ca.vertcat(q, v, last), restoring])
     return first, step
 
 
@@ -238,17 +241,17 @@ def _recursion(form: LawForm, steps: int, directions: int, given: int) -> ca.Fun
     These are by the first state, by the participation in each direction, by the numbers of the mode, and by those that
     a level depends upon which is given at each step's end: it and its derivatives are so many rows, none of an own one.
     """
-    step = _functions(form)[1]
+    ends = min(given, 1)
+    step = _functions(form, ends)[1]
     state, load, h, p = (ca.SX.sym(*one) for one in (("z", 3), ("u", 2), ("h", 1), ("p", 3 + form.size)))
     level = ca.SX.sym("A", given)
-    after, restoring = step(state, load, h, p)
-    after = ca.vertcat(after[:2], level[:1]) if given else after
+    after, restoring = step(state, load, level[:ends], h, p)
     if not directions:
         both = [after, ca.vertcat(restoring, state[2])]
         return ca.Function("once", [state, load, level, h, p], both).mapaccum("motion", steps)
     others = max(given - 1, 0)
     moves, motions = ca.SX.sym("S", 3, 2 + directions + p.numel() + others), ca.SX.sym("U", 2, directions)
-    of_level = ca.vertcat(ca.SX.zeros(2, others), level[1:].T) if given else ca.SX.zeros(3, 0)
+    of_level = ca.jacobian(after, level[:ends]) @ level[1:].T if given else ca.SX.zeros(3, 0)
     direct = ca.horzcat(ca.SX.zeros(3, 2), ca.jacobian(after, load) @ motions, ca.jacobian(after, p), of_level)
     moved = ca.jacobian(after, state) @ moves + direct
     by = ca.jacobian(restoring, state) @ moves

@@ -62,11 +62,11 @@ def by_runge_kutta(form, fall, rise, u, initial, steps=4):
     ],
 )
 def test_the_motion_is_that_of_an_independent_integrator(form, fall, rise):
-    u, initial, fine = load(), (2e-3, 0.03), 8
-    dense = np.interp(np.arange((u.size - 1) * fine + 1) / fine, np.arange(u.size), u)
+    """Steps with the frequency and damping of their beginning miss by three to eighteen times as much."""
+    u, initial = load(), (2e-3, 0.03)
     expected = by_runge_kutta(form, fall, rise, u.tolist(), initial)
-    found = motion(form, dense, 1 / (RATE * fine), numbers(fall, rise), np.array(initial))[0][0, ::fine]
-    assert np.linalg.norm(found - expected) < 3e-4 * np.linalg.norm(expected)
+    found = motion(form, u, 1 / RATE, numbers(fall, rise), np.array(initial))[0][0]
+    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("form", [LawForm(0.5, -1.0, 20.0), LawForm(1.0, 2.0, 20.0)])
