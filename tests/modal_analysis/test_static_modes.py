@@ -89,6 +89,15 @@ def test_poles_close_above_the_lines_draw_nothing_off_the_modes_within(number):
         assert np.abs(off).max() < 4
 
 
+def test_one_pole_for_two_close_modes_above_the_lines_promises_little_and_gets_another():
+    """Modes at 28.0 and 29.6 Hz: as one pole they look like a gain, and a right sensor was accused by 4 deviations."""
+    plate = continuous_structure(59)
+    found = sysid.identify(sysid.Problem(draw(plate).measurement, mass=sysid.FullMass()), rng=0)
+    beyond = found.structure.residual
+    assert beyond.count - beyond.static == np.count_nonzero(plate.frequencies[3:] < 30.0) == 2
+    assert found.determined and not found.contradictions
+
+
 def test_a_pole_beside_one_above_the_lines_leaves_the_rigid_body_mass_as_it_is():
     """One pole alone lies where residual modes need more mass than there is, which M_rb made up for (8 deviations)."""
     frame = continuous_structure(13)
