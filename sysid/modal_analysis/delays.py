@@ -183,6 +183,9 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
         other = _settled(_with_one_above(_Late(still, clocks, delays, at.at.poles)))
         end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
+    # Poles that were looked for roughly may lack weak modes, which delays of most channels then stand for.
+    anew = _settled(_with_one_above(_Late(still, clocks, complex_.delays, complex_.poles)))
+    end = anew if anew.explains_more_than(end) else end
     # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
     if complex_.shows_beyond(end) or not end.explains_more_than(complex_):
         end = _settled(complex_)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.band.above_first_mode import cut
 from benchmarks.band.simulated_tests import draw
 from benchmarks.band.structures import structure as continuous
 from benchmarks.records.simulated import Records, Run, four_storeys
@@ -262,6 +263,12 @@ def test_a_mode_close_above_the_lines_makes_no_channel_late():
     """Complex residues of poles in the lines stand for it, real ones beside terms without poles do not."""
     clean = draw(continuous(0), 2).measurement
     assert not find_delays(clean, beside_poles(clean))
+
+
+@pytest.mark.parametrize("test", [cut(1), cut(12), continuous(42)], ids=["below", "weakly below", "weak"])
+def test_modes_that_poles_miss_at_first_make_no_channel_late(test):
+    """Modes below the lines, and weak ones of fourteen: complex residues find them, real ones and delays did not."""
+    assert not Clock.of(draw(test).measurement).delays
 
 
 @pytest.mark.parametrize("periods", [0.05, 0.2, 0.249, 0.26, 0.9, 1.5])
