@@ -179,13 +179,11 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     if not far and first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
     end = _settled(first)
-    for delays, at in far:
-        other = _settled(_with_one_above(_Late(still, clocks, delays, at.at.poles)))
-        end = other if other.explains_more_than(end) else end
     complex_ = _settled(complex_, held=True)
     # Poles that were looked for roughly may lack weak modes, which delays of most channels then stand for.
-    anew = _settled(_with_one_above(_Late(still, clocks, complex_.delays, complex_.poles)))
-    end = anew if anew.explains_more_than(end) else end
+    for delays, poles in [*((delays, at.at.poles) for delays, at in far), (complex_.delays, complex_.poles)]:
+        other = _settled(_with_one_above(_Late(still, clocks, delays, poles)))
+        end = other if other.explains_more_than(end) else end
     # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
     if complex_.shows_beyond(end) or not end.explains_more_than(complex_):
         end = _settled(complex_)

@@ -265,10 +265,10 @@ def test_a_mode_close_above_the_lines_makes_no_channel_late():
     assert not find_delays(clean, beside_poles(clean))
 
 
-@pytest.mark.parametrize("test", [cut(1), cut(12), continuous(42)], ids=["below", "weakly below", "weak"])
-def test_modes_that_poles_miss_at_first_make_no_channel_late(test):
+@pytest.mark.parametrize(("structure", "number"), [(cut, 1), (cut, 12), (continuous, 42)])
+def test_modes_that_poles_miss_at_first_make_no_channel_late(structure, number):
     """Modes below the lines, and weak ones of fourteen: complex residues find them, real ones and delays did not."""
-    assert not Clock.of(draw(test).measurement).delays
+    assert not Clock.of(draw(structure(number)).measurement).delays
 
 
 @pytest.mark.parametrize("periods", [0.05, 0.2, 0.249, 0.26, 0.9, 1.5])
