@@ -84,8 +84,9 @@ CEILINGS = {
     # turns (36); and tables that say what was taken off within tolerances, frequencies to the digits of their
     # intervals, shares that are no per cent (25); and no law where all modes left have one (6), and laws of
     # modes that are within the lines at some level (18); their motion by the mean level of each step (3);
-    # poles beside one that stands for two (13); delays from poles of complex residues (8).
-    "lines": 49_739,
+    # poles beside one that stands for two (13); delays from poles of complex residues (8), and their steps (3);
+    # scores of blocks by products with vectors (21).
+    "lines": 49_763,
     # The law of a mode, its spectra, its fit; growing errors; rocking tables; the first modes.
     "files": 194,
     # What was counted when these counts began; the modes once, in the open, brings them down.

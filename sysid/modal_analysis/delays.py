@@ -243,11 +243,14 @@ class _Late(BesideTerms):
         self.unknowns = self.count * self.left.shape[1]
 
     def moved(self, poles: Array, delays: Array) -> _Late:
-        """The fit after a step, in which no pole becomes one that answers like a term without poles."""
-        m = self.omega.size
+        """The fit after a step, in which no pole becomes one that answers like a term without poles.
+
+        No delay moves by more than a quarter of a period of the last line: what a longer one does is not linear in it.
+        """
+        m, most = self.omega.size, 0.25 / self.test.freq[-1]
         poles = self.poles + np.clip(poles, -0.3, 0.3)
         poles[m:] = np.minimum(poles[m:], np.log(MOST_DAMPED))
-        return _Late(self.still, self.clocks, self.delays + delays, poles, self.complex_residues)
+        return _Late(self.still, self.clocks, self.delays + np.clip(delays, -most, most), poles, self.complex_residues)
 
     @cached_property
     def of_clock(self) -> Array:

@@ -143,6 +143,30 @@ def half_inverse(normal: Array, least: float) -> Array:
     return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
 
 
+def over_root_of_rest(
+    half: Array, normal: Array, score: Array, most: float, steps: int = 50, exact: float = 1e-8
+) -> Array:
+    """``(I - T)^-1/2 s`` with ``T = H' N H``, of H (p, r), N (p, p), s (r,); eigenvalues of T count as `most` at most.
+
+    By Lanczos's method (Y. Saad, SIAM J. Numer. Anal. 29 (1992) 209-228): r is many, products with a vector are cheap.
+    """
+    size = float(norm(score))
+    basis, along, beside, found = [score / max(size, np.finfo(float).tiny)], list[float](), list[float](), score
+    for _ in range(steps):
+        Q = np.array(basis)
+        ahead = half.T @ (normal @ (half @ Q[-1]))
+        along.append(float(Q[-1] @ ahead))
+        for _ in range(2):  # once leaves round-off
+            ahead = ahead - Q.T @ (Q @ ahead)
+        taken, turn = scipy.linalg.eigh_tridiagonal(along, beside)
+        before, found = found, size * (turn @ (turn[0] / np.sqrt(1 - np.clip(taken, 0.0, most)))) @ Q
+        beside.append(float(norm(ahead)))
+        if beside[-1] < exact or norm(found - before) <= exact * norm(found):
+            break
+        basis.append(ahead / beside[-1])
+    return np.asarray(found)
+
+
 def score(equations: NormalEquations, added: NDArray[np.bool_]) -> tuple[float, int]:
     """Fall of twice the sum of squares that `added` unknowns (p,) promise in one step, and how many of them show.
 

@@ -26,7 +26,7 @@ from sysid.measurement.channels import without_constants
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import Delays, delays_beyond_chance, least_delay
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.least_squares import half_inverse, score, unit_diagonal
+from sysid.modal_analysis.least_squares import half_inverse, over_root_of_rest, score, unit_diagonal
 from sysid.modal_analysis.modal_estimate import Excess, Gains, VaryingLevel
 from sysid.modal_analysis.noise_levels import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_fit import RecordFit, refitted
@@ -209,10 +209,8 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
             at = size[run_columns.unknowns]
             for lines in line_blocks(run, fit, shift):
                 products = model.chunk(p, run.at(lines)).products(fit.levels, run_columns)
-                score = half[run_columns.unknowns].T @ (products.gradient / at)
-                inner = half[run_columns.unknowns].T @ (products.normal / np.outer(at, at)) @ half[run_columns.unknowns]
-                taken, turn = np.linalg.eigh(inner)
-                grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
+                root = half[run_columns.unknowns] / at[:, None]
+                grown = over_root_of_rest(root, products.normal, root.T @ products.gradient, _TAKEN)
                 meat += np.outer(grown, grown) / partitions
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
     kept = model.kept

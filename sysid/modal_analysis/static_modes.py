@@ -69,7 +69,8 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor, promising: float = 0.
     """The fit with further poles between the last line and its static modes, by Akaike's criterion: they are no modes.
 
     See `ModeFit.with_static` of spectra. Where one pole stands for two close modes, what a second one is worth shows
-    once both have moved: those that promise this share of their price are tried.
+    once both have moved: those that promise this share of their price are tried. Records of many sensors may ask for
+    twice as many as spectra have; with fewer, modes in the lines take on what is missing.
     """
     last, far = 2 * np.pi * fit.test.freq[-1] * np.array([1.0, STATIC_POLE[0]])
     near = last, np.sqrt(last * far)  # from further away a pole would go where the static modes are
@@ -78,8 +79,7 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor, promising: float = 0.
         m, modes = fit.model.m, fit.parameters.modes
         price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
         above = np.count_nonzero(modes.omega > last) - fit.static
-        # As many as of spectra.
-        if above > max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
+        if above > 2 * max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
             return fit
         more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, monitor=monitor)
         if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley

@@ -200,6 +200,16 @@ def test_descent_is_the_slope_of_what_is_left_with_residues_free(whole, complex_
         assert at.equations[1][m + k] == pytest.approx(-slope, rel=1e-4, abs=1e-6 * np.abs(at.equations[1][m:]).max())
 
 
+def test_a_step_turns_no_line_by_more_than_a_quarter_of_a_period():
+    """A step along what hardly shows is of any length; what turned records hold at their ends would fill the memory."""
+    test = record(LATE[0])
+    beside = beside_poles(test)
+    at = _Late(_joined(beside.test), _clocks(test), np.zeros(5), beside.at.poles)
+    asked = np.array([6e3, -2.0, 1e-4, 0.0, -1e-4])
+    turned = at.moved(np.zeros(at.poles.size), asked).delays * test.freq[-1]
+    np.testing.assert_allclose(turned, [0.25, -0.25, *asked[2:] * test.freq[-1]])
+
+
 def test_one_delay_of_all_is_that_of_the_base_and_few_are_those_of_these():
     covariance = 1e-10 * (np.eye(4) + 0.2)
     alike = delays_beyond_chance(np.full(4, 5e-4), covariance, 0.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.modal_analysis.least_squares import SumOfSquares, minimise
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise, over_root_of_rest
 from sysid.modal_analysis.modal_model import NormalEquations
 
 STEEP = 1e3  # of the walls of the valley
@@ -50,3 +50,17 @@ def test_a_curved_valley_is_followed_to_its_end():
 
 def test_bent_steps_are_fewer():
     assert 2 * steps_of(valley(bent=True))[1] < steps_of(valley(bent=False))[1]
+
+
+def test_a_score_over_the_root_of_the_rest_is_that_of_all_eigenvalues() -> None:
+    """Of which none counts for more than .98, and most may be next to none."""
+    rng = np.random.default_rng(0)
+    half, rows = rng.standard_normal((50, 40)), rng.standard_normal((50, 12)) * np.geomspace(1e-3, 1.0, 12)
+    inner = half.T @ rows @ rows.T @ half
+    rows *= np.sqrt(1.05 / np.linalg.eigvalsh(inner)[-1])
+    taken, turn = np.linalg.eigh(half.T @ rows @ rows.T @ half)
+    score = half.T @ rows @ rng.standard_normal(12)
+    assert over_root_of_rest(half, rows @ rows.T, score, 0.98) == pytest.approx(
+        turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, 0.98))), rel=1e-6
+    )
+    assert not np.any(over_root_of_rest(half, rows @ rows.T, np.zeros(40), 0.98))
