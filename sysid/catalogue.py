@@ -110,6 +110,9 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
             signature.bind(data=data, rng=recipe.rng, **recipe.parameters)
         except TypeError as error:
             raise InputError(f"{path}: problem() {error}; {_in_words(signature)}") from None
+        for name, value in recipe.parameters.items():
+            if isinstance(value, str) and isinstance(signature.parameters[name].default, bool):
+                raise InputError(f"{path}: {name} = {value!r}; give True or False")
         with _telling_the_line(path):
             problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):

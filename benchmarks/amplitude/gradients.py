@@ -8,7 +8,7 @@ import numpy as np
 
 import sysid
 from benchmarks.amplitude.softening_storeys import LEVELS, Array, recorded, shaken, storeys
-from benchmarks.line import Line, below
+from benchmarks.line import Line, above, below
 from sysid.modal_analysis.record_model import RecordModel
 
 
@@ -42,8 +42,9 @@ def lines(reduced: bool) -> Iterator[Line]:
             near, far = (_difference(model, fit.levels, point, times * step) for times in (0.01, 0.02))
             slope = (8 * near - far) / 0.12
             worst = max(worst, abs(slope - gradient @ step) / np.abs(gradient * step).sum())
-    text = f"gradient of a fit with {len(fit.parameters.laws)} law beside differences of fourth order, five points"
-    yield below(f"{text} in five directions: largest difference", float(worst), 1e-6)
+    text = "gradient of a fit with a law beside differences of fourth order, five points in five directions"
+    yield below(f"{text}: largest difference", float(worst), 1e-6)
+    yield above("laws of this fit", len(fit.parameters.laws), 1)
 
 
 def _difference(model: RecordModel, levels: Array, at: Array, step: Array) -> float:

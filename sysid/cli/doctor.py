@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sysid.cli.output import Output
 from sysid.cli.starting import MISTAKE, SUCCESS
@@ -21,6 +22,7 @@ from sysid.files.assembly import recorded_rate
 from sysid.files.description import Description, asked
 from sysid.files.kind import channels_of, coarse_lines, kind_of
 from sysid.files.reading import gather, recordings_of
+from sysid.files.recorded_test import is_recorded_test
 from sysid.files.recording import Recording
 from sysid.results.version import __version__
 
@@ -93,8 +95,14 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 def _look(names: list[str], out: Output) -> int:
     """Tell channels and kind of the runs of some files, and what `sysid read` still needs to be told."""
-    files = [Path(name) for name in names]
-    said, missing, runs = asked(None, files), list[str](), []
+    every, missing, runs = [Path(name) for name in names], list[str](), list[dict[str, Any]]()
+    tests = [one for one in every if _is_test(one)]
+    out.write("".join(f"{one}: a test that 'sysid read' wrote; 'sysid show {one}' tells of it\n" for one in tests))
+    files = [one for one in every if one not in tests]
+    if not files:
+        out.answer(runs=runs, missing=missing)
+        return SUCCESS
+    said = asked(None, files)
     base = [str(channel.column) for channel in said.channels if channel.role == "base"]
     for one in _recordings(files, said):
         kind, channels, rate = kind_of(one, base), channels_of(one), ""
@@ -114,6 +122,13 @@ def _look(names: list[str], out: Output) -> int:
     out.answer(runs=runs, missing=missing)
     out.write("".join(f"missing: {one}\n" for one in dict.fromkeys(missing)) or "'sysid read' takes them as they are\n")
     return SUCCESS
+
+
+def _is_test(file: Path) -> bool:
+    """True of a file that `sysid read` wrote."""
+    with contextlib.suppress(InputError):
+        return is_recorded_test(file)
+    return False
 
 
 def _recordings(files: list[Path], said: Description) -> list[Recording]:

@@ -203,6 +203,13 @@ def _export(options: argparse.Namespace, out: Output) -> int:
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
     precision = formats.precision(target)
     out.write(f"{form.name}; precision: {precision}{without}\n")
+    for law in result.structure.laws:
+        if options.level is not None and law.is_beyond(options.level):
+            low, high = law.levels
+            out.warn(
+                f"mode {law.mode + 1} was tested from {low:.3g} to {high:.3g} m/s²: at {options.level:g} m/s² its "
+                "frequency and damping are extrapolated"
+            )
     out.answer(format=form.name, precision=precision, deviations=form.deviations, judgement=result.judgement)
     if result.interrupted or not result.determined:
         out.warn(f"{target.name}: {content.reliability(result)}. Read {form.note}, or report.html")

@@ -192,15 +192,14 @@ def _level_in_words(content: Content) -> Iterator[str]:
     it, level = content.it, content.level
     for law in it.structure.laws:
         mode, low, high = law.mode + 1, *law.levels
-        frequency, ratio = law.at(level or 0.0)
+        frequency, ratio = (law.frequency, law.ratio) if level is None else law.at(level)
         whose = f"mode {law.level_of + 1}'s" if law.followed else "its"
-        where = f"at {level:.6g} m/s2" if level is not None else "at rest"
-        beyond = level is not None and not low <= level <= high
+        where = f"at {level:.6g} m/s2" if level is not None else "at rest, 0 m/s2,"
         yield (
             f"level: mode {mode} follows {whose} amplitude; these matrices are those {where} of {whose} relative "
             f"acceleration at {it.measurement.sensor_names[law.sensor]} ({frequency:.6g} Hz, damping ratio "
             f"{ratio:.4g}); it was tested from {low:.3g} to {high:.3g} m/s2"
-            f"{', so that they are extrapolated' * beyond}; deviations are "
+            f"{', so that they are extrapolated' * law.is_beyond(level or 0.0)}; deviations are "
             "those at rest"
         )
 

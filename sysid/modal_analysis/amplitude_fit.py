@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, Stop
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.law_spectra import LawMotions
 from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.misfit import at_lines, left_of
 from sysid.modal_analysis.modal_fit import Modes, modes_within
@@ -254,9 +255,8 @@ def _started(
     ends = np.where(followed[:, None], 0.0, p.ends)  # of a mode with a law they are its first state
     ones = np.ones((fit.test.n_runs, 2))
     if tries:
-        sensor = int(np.argmax(np.abs(p.modes.phi[:, mode])))
-        form = LawForm(*exponents, float(np.concatenate(_envelopes(fit, mode, sensor)).max()))
-        law = ModeLaw(mode, sensor, form, np.zeros(2), ones)
+        law = ModeLaw(mode, int(np.argmax(np.abs(p.modes.phi[:, mode]))), LawForm(*exponents, 1.0), np.zeros(2), ones)
+        law = _of_highest_level(law, _in_runs(fit, replace(p, ends=ends), law)[0])
     else:
         law = p.laws[0]._replace(mode=mode, equivalent=ones, likelier=False, level_of=p.laws[0].followed)
     for values in [np.array([fall, 0.0]) for fall in tries] or [law.values, 0 * law.values]:
@@ -278,7 +278,7 @@ def _with_exponent(fit: RecordFit, number: int, exponent: float) -> Parameters:
     """
     p = _with_equivalents(fit)
     law, omega, ratios = p.laws[-1], p.modes.omega.copy(), p.modes.ratios.copy()
-    unit = np.quantile(np.concatenate(_envelopes(fit, law.followed, law.sensor)), (0.3, 0.95)) / law.form.level
+    unit = np.quantile(np.concatenate(_in_runs(fit, p, law)[0]), (0.3, 0.95)) / law.form.level
     values, pole = law.values.copy(), [1.0, 1.0]
     before, after = unit ** law.form[number], unit**exponent
     values[number] *= (before[1] - before[0]) / (after[1] - after[0])
@@ -301,7 +301,8 @@ def _shared(fit: RecordFit) -> float:
 def _with_equivalents(fit: RecordFit) -> Parameters:
     """The parameters with the linear mode of each run that is nearest to what its law does there.
 
-    Frequency and damping are means over the time, each weighed by the square of the mode's own level.
+    Frequency and damping are means over the time, weighed by the square of the mode's own motion. Numbers of a law are
+    those at the highest level of the records from here on.
     """
     p, laws = fit.parameters, []
     for law in p.laws:
@@ -309,25 +310,27 @@ def _with_equivalents(fit: RecordFit) -> Parameters:
         A = ca.SX.sym("A")
         both = law.form.at(A, ca.SX(omega), ca.SX(ratio), ca.SX(ca.DM(law.values)))
         function = ca.Function("both", [A], [ca.horzcat(*both) / np.array([[omega, ratio]])])
+        levels, motions = _in_runs(fit, p, law)
         equivalent = []
-        levels = _envelopes(fit, law.followed, law.sensor)
-        for level, motion in zip(levels, _envelopes(fit, law.mode, law.sensor), strict=True):
+        for level, motion in zip(levels, motions, strict=True):
             values = np.asarray(function.map(level.size)(level[None]).full()).reshape(2, -1, order="F")
             equivalent.append(values @ motion**2 / (motion @ motion))
-        laws.append(law._replace(equivalent=np.maximum(equivalent, 0.1)))
+        laws.append(_of_highest_level(law._replace(equivalent=np.maximum(equivalent, 0.1)), levels))
     return replace(p, laws=tuple(laws))
 
 
-def _envelopes(fit: RecordFit, mode: int, sensor: int) -> list[Array]:
-    """Level of a mode at a sensor at all samples of each run, m/s²."""
-    whole = fit.model.whole
-    spectra = [np.zeros(samples, complex) for samples in whole.samples]
-    for chunk in fit.model.chunks(fit.parameters):
-        spectrum = spectra[chunk.run.number]
-        at = np.round(chunk.run.w / (2 * np.pi) * spectrum.size / whole.sample_rate).astype(int)
-        spectrum[at] = 2 * chunk.motion[mode]  # analytic: its modulus is the envelope
-    size = abs(fit.parameters.modes.phi[sensor, mode]) * whole.sample_rate
-    return [np.abs(np.fft.ifft(spectrum)) * size for spectrum in spectra]
+def _in_runs(fit: RecordFit, p: Parameters, law: ModeLaw) -> tuple[list[Array], list[Array]]:
+    """Level that a law follows, m/s², and restoring acceleration of its mode, at all samples of each run."""
+    motions = fit.model.law_motions or LawMotions(fit.test)
+    runs = [motions.in_run(p, run, law) for run in range(fit.test.n_runs)]
+    return [level for level, _ in runs], [motion for _, motion in runs]
+
+
+def _of_highest_level(law: ModeLaw, levels: Sequence[Array]) -> ModeLaw:
+    """The same law with its numbers at the highest of these levels."""
+    highest = float(max(level.max() for level in levels))
+    values = law.values * (highest / law.form.level) ** np.array(law.form[:2])
+    return law._replace(form=law.form._replace(level=highest), values=values)
 
 
 def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
@@ -344,7 +347,7 @@ def fitted_laws(fit: RecordFit) -> tuple[FittedLaw, ...]:
         first += law.form.size
         pole = float(p.modes.omega[law.mode] / (2 * np.pi)), float(p.modes.ratios[law.mode])
         other = 0.0 if law.level_of is None else float(p.modes.omega[law.level_of] / (2 * np.pi))
-        level, cov = np.concatenate(_envelopes(fit, law.followed, law.sensor)), covariance[np.ix_(at, at)]
+        level, cov = np.concatenate(_in_runs(fit, p, law)[0]), covariance[np.ix_(at, at)]
         levels = float(np.quantile(level, 0.05)), float(level.max())
         found.append(FittedLaw(*pole, law.sensor, law.form, law.values, levels, cov, law.likelier, followed=other))
     return tuple(found)

@@ -178,17 +178,18 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     complex_ = _Late(still, clocks, first.delays, first.poles, complex_residues=True)
     if not far and first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
-    end = _settled(first)
-    complex_ = _settled(complex_, held=True)
-    # Poles that were looked for roughly may lack weak modes, which delays of most channels then stand for.
+    end, complex_ = _settled(first), _settled(complex_, held=True)
+    # Rough poles may lack weak modes, or close ones, which delays of most channels then stand for.
     for delays, poles in [*((delays, at.at.poles) for delays, at in far), (complex_.delays, complex_.poles)]:
         other = _settled(_with_one_above(_Late(still, clocks, delays, poles)))
         end = other if other.explains_more_than(end) else end
+    full = _with_further_poles(first)
+    if full.explains_more_than(end) and not (end := _settled(full)).explains_more_than(full):
+        return none
     # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
-    if complex_.shows_beyond(end) or not end.explains_more_than(complex_):
-        end = _settled(complex_)
-        if not end.explains_more_than(complex_):
-            return none
+    open_ = complex_.shows_beyond(end) or not end.explains_more_than(complex_)
+    if open_ and not (end := _settled(complex_)).explains_more_than(complex_):
+        return none
     return _found(end, test) or none
 
 
@@ -251,6 +252,11 @@ class _Late(BesideTerms):
         poles = self.poles + np.clip(poles, -0.3, 0.3)
         poles[m:] = np.minimum(poles[m:], np.log(MOST_DAMPED))
         return _Late(self.still, self.clocks, self.delays + np.clip(delays, -most, most), poles, self.complex_residues)
+
+    def with_pole(self, omega: float, ratio: float) -> _Late:
+        """The fit beside one more pole, rad/s."""
+        poles = np.insert(self.poles, [self.omega.size, self.poles.size], np.log([omega, ratio]))
+        return _Late(self.still, self.clocks, self.delays, poles, self.complex_residues)
 
     @cached_property
     def of_clock(self) -> Array:
@@ -346,13 +352,26 @@ class _Late(BesideTerms):
 def _with_one_above(fit: _Late, above: float = 1.3) -> _Late:
     """The fit with one more pole, so far above the lines, where that explains more.
 
-    Complex residues of poles in the lines stand for a mode close above them, and real ones do not: what these leave of
-    it looks like delays.
+    Complex residues in the lines stand for a mode close above, and what real ones leave of it looks like delays.
     """
-    poles = fit.poles.reshape(2, -1)
-    beyond = np.log([[2 * np.pi * above * fit.test.freq[-1]], [GUESS]])
-    more = _Late(fit.still, fit.clocks, fit.delays, np.hstack([poles, beyond]).ravel(), fit.complex_residues)
+    more = fit.with_pole(2 * np.pi * above * fit.test.freq[-1], GUESS)
     return more if more.explains_more_than(fit) else fit
+
+
+def _with_further_poles(fit: _Late, most: int = 8) -> _Late:
+    """The fit with further poles, so many at most, each where most is left, as long as they explain more."""
+    loss, (first, last) = (
+        np.exp(np.median(fit.poles[fit.omega.size :])),
+        2 * np.pi * fit.test.freq[[0, -1]] * [1.0, 1.3],
+    )
+    at = np.geomspace(first, last, int(np.log(last / first) / loss) + 2)
+    functions = fit.records.functions(at, np.full(at.size, loss))
+    for _ in range(most):
+        gain = fit.basis.explained(functions, fit.left / fit.level).reshape(at.size, -1).sum(axis=1)
+        before, fit = fit, _settled(fit.with_pole(at[np.argmax(gain)], loss), held=True)
+        if not fit.explains_more_than(before):
+            return before
+    return fit
 
 
 def _of_runs(test: Measurement, records: Records) -> Array:

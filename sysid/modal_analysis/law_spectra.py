@@ -75,6 +75,11 @@ class LawMotions:
         spectra[: 5 + d] -= [*linear, by_omega * load, by_ratio * load]
         return np.asarray(spectra)
 
+    def in_run(self, p: Parameters, run: int, law: ModeLaw) -> tuple[Array, Array]:
+        """Level that a law follows, m/s², and restoring acceleration of its mode, both (n,) at the samples of a run."""
+        rows, levels = self._moved(p, run, law, slopes=False)
+        return levels[0, :: self._steps[law.mode]], rows[0]
+
     def _moved(self, p: Parameters, run: int, law: ModeLaw, slopes: bool) -> tuple[Array, Array]:
         """Rows of `motion` at the samples of a run, and its level at all steps; those of the last numbers are kept."""
         modes, k, level = p.modes, law.mode, None
@@ -176,8 +181,8 @@ def _clock_of(test: Measurement) -> tuple[float, tuple[int, ...], tuple[bool, ..
             "modes that follow their amplitude move as the records in time say, and of these lines the sample rate is "
             "not known: make the test of records (Measurement.from_time)"
         )
-    samples = round(test.sample_rate / np.diff(test.freq).min())
-    return test.sample_rate, (samples,) * test.n_runs, (True,) * test.n_runs
+    samples = tuple(round(test.sample_rate / np.diff(test.freq[lines]).min()) for lines in test.own_lines)
+    return test.sample_rate, samples, (True,) * test.n_runs
 
 
 def added_by_laws(test: Measurement, structure: Structure) -> tuple[ComplexArray, ComplexArray]:

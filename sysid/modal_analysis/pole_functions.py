@@ -115,6 +115,13 @@ class Basis(NamedTuple):
             mixed.append(self.shared[rows].T @ left)
         return Beside(functions, shared, by_run, mixed)
 
+    def explained(self, functions: PoleFunctions, left: Array) -> Array:
+        """Squares of what a fit by this basis leaves, (rows, c), that each other column would explain, (columns,)."""
+        beside = self.beside(functions)
+        squares = beside.squares()
+        products = beside.products(beside.shared.T @ left, left)
+        return np.asarray(np.sum(products**2, axis=1) / np.maximum(squares, ROUND_OFF * squares.max()))
+
 
 class Beside(NamedTuple):
     """Columns of pole functions less their projections on a `Basis`.

@@ -199,6 +199,7 @@ class Identification(Answer):
             "residuals": list(self.residuals),
             "objective": self.objective,
             "force_residual": self.force_residual,
+            "validation_residuals": [test.residual(self.structure) for test in self.validation],
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
             "natural_frequencies_std_hz": _plain(self.quick_std("natural_frequencies")),
             "damping_ratios": _plain(self.identified_ratios),

@@ -159,10 +159,22 @@ class FittedLaw:
         w, zeta = self.form.at(ca.SX(level), ca.SX(self.frequency), ca.SX(self.ratio), ca.SX(ca.DM(self.values)))
         return float(w), float(zeta)
 
+    @property
+    def formula(self) -> str:
+        """Frequency, Hz, and damping ratio by the level A, m/s², in words."""
+        (a, b), (p, q, top) = self.values, self.form
+        fall, rise = (f"{value:.3g} (A/{top:.3g})^{exponent:g}" for value, exponent in ((a, p), (b, q)))
+        text = f"{self.frequency:.5g} (1 - {fall}) Hz and {self.ratio:.3g} + {rise}"
+        return text.replace("- -", "+ ").replace("+ -", "- ")
+
     def reaches(self, low: float, high: float) -> bool:
         """True where the mode is between two frequencies, Hz, at some of the levels that it moved at."""
         ends = [self.at(level)[0] for level in self.levels]
         return min(ends) <= high and max(ends) >= low
+
+    def is_beyond(self, level: float) -> bool:
+        """True of a level, m/s², that the mode did not move at."""
+        return not self.levels[0] <= level <= self.levels[1]
 
     def changes_at(self, level: float, omega: float, ratio: float) -> tuple[float, float]:
         """``w² - w0²`` and ``2 (zeta w - zeta0 w0)`` at a level, of a mode of `omega`, rad/s, and `ratio` at rest."""
@@ -195,9 +207,9 @@ class FittedLaw:
 def _functions(form: LawForm, given: int = 0) -> tuple[ca.Function, ca.Function]:
     """First state and one step of the motion of a mode, under a load that is linear between samples.
 
-    The numbers of the mode are ``(log w0, log zeta0, log size, law)``; a state is ``(q, q', A)``, A that of the
-    acceleration by the frequency of the level before: the law itself lowers the level that it is of. A step has the
-    frequency and damping of the mean of the levels at both ends, the last one `given` or by a step as at the beginning.
+    The numbers of the mode are ``(log w0, log zeta0, log size, law)``; a state is ``(q, q', A)``. The law moves the
+    level that it is of: Newton's steps find it. A step has the frequency and damping of the mean of the levels at both
+    ends, the last one `given` or by a step as at the beginning: so it is of second order.
     The first function takes ``(q, q')`` and these numbers. The second takes a state, the load at both ends of the step,
     the `given` level, its length and these numbers, and gives the next state and ``-2 zeta w q' - w² q`` at its
     beginning.
@@ -205,19 +217,27 @@ def _functions(form: LawForm, given: int = 0) -> tuple[ca.Function, ca.Function]
     p, h, end = ca.SX.sym("p", 3 + form.size), ca.SX.sym("h"), ca.SX.sym("A", given)
     omega, ratio, size = ca.exp(p[0]), ca.exp(p[1]), ca.exp(p[2])
 
-    def level(q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
+    def of_acceleration(q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
         return size * w * ca.sqrt((w * q) ** 2 + v**2 + (1e-12 * form.level / (size * omega)) ** 2)
 
+    A, at = ca.SX.sym("near"), ca.SX.sym("at", 2)
+    off = A - of_acceleration(at[0], at[1], form.at(A, omega, ratio, p[3:])[0])
+    # Newton's step to the level that the law is of and lowers itself; of one that rises the slope may vanish.
+    closer = ca.Function("closer", [A, at, p], [ca.fmax(A - off / ca.fmax(ca.jacobian(off, A), 0.2), 0.0)])
+
+    def level(q: ca.SX, v: ca.SX, near: ca.SX, steps: int) -> ca.SX:
+        for _ in range(steps):
+            near = closer(near, ca.vertcat(q, v), p)
+        return near
+
     begin = ca.SX.sym("begin", 2)
-    w = omega
-    for _ in range(4):
-        w, _ = form.at(level(begin[0], begin[1], w), omega, ratio, p[3:])
-    first = ca.Function("first", [begin, p], [ca.vertcat(begin, level(begin[0], begin[1], w))])
+    linear = of_acceleration(begin[0], begin[1], omega)
+    first = ca.Function("first", [begin, p], [ca.vertcat(begin, level(begin[0], begin[1], linear, 8))])
     state, load = ca.SX.sym("z", 3), ca.SX.sym("u", 2)
     w, zeta = form.at(state[2], omega, ratio, p[3:])
-    near = end if given else level(*_step(state, load[0], load[1], h, w, zeta), w)
+    near = end if given else level(*_step(state, load[0], load[1], h, w, zeta), state[2], 2)
     q, v = _step(state, load[0], load[1], h, *form.at((state[2] + near) / 2, omega, ratio, p[3:]))
-    last = end if given else level(q, v, form.at(near, omega, ratio, p[3:])[0])
+    last = end if given else level(q, v, near, 2)
     restoring = -2 * zeta * w * state[1] - w**2 * state[0]
     step = ca.Function("step", [state, load, end, h, p], [ca.vertcat(q, v, last), restoring])
     return first, step

@@ -60,6 +60,9 @@ def test_what_is_missing_is_told_until_nothing_is(tmp_path, capsys):
     assert told(capsys, str(path))["missing"] == []
     assert cli.main(["doctor", str(tmp_path / "none.csv")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    test = str(tmp_path / "test.h5")
+    assert cli.main(["read", str(path), "--out", test, "--quiet"]) == 0
+    assert told(capsys, test) == told(capsys, test) | {"runs": [], "missing": []}
 
 
 @pytest.mark.parametrize("command", ["doctor", "read"])

@@ -12,7 +12,16 @@ from benchmarks.band.structures import structure as continuous
 from benchmarks.records.simulated import Records, Run, four_storeys
 from sysid.measurement.channels import without_delays
 from sysid.measurement.whole import WholeRecords
-from sysid.modal_analysis.delays import Clock, Delays, _clocks, _joined, _Late, delays_beyond_chance, find_delays
+from sysid.modal_analysis.delays import (
+    Clock,
+    Delays,
+    _clocks,
+    _joined,
+    _Late,
+    _with_further_poles,
+    delays_beyond_chance,
+    find_delays,
+)
 from sysid.modal_analysis.direct_terms import beside_poles
 from sysid.modal_analysis.first_modes import _newly_late, first_modes, rough_fit, shadows_of
 from sysid.modal_analysis.fit import whole_fit
@@ -198,6 +207,15 @@ def test_descent_is_the_slope_of_what_is_left_with_residues_free(whole, complex_
         step = h * np.eye(5)[k]
         slope = (left(at.poles, delays + step) - left(at.poles, delays - step)) / (2 * h)
         assert at.equations[1][m + k] == pytest.approx(-slope, rel=1e-4, abs=1e-6 * np.abs(at.equations[1][m:]).max())
+
+
+def test_a_mode_that_the_poles_lack_is_found_before_delays_stand_for_it():
+    test, truth = spectra([0.0] * 5), SETTING.structure
+    omega = 2 * np.pi * truth.natural_frequencies
+    lacking = np.delete(np.log([omega, truth.damping_ratios]), 1, axis=1).ravel()
+    full = _with_further_poles(_Late(_joined(test), _clocks(test), np.zeros(5), lacking))
+    assert np.sort(full.omega) == pytest.approx(omega, rel=1e-3)
+    assert full.promise() < 30.0  # five squares of chance
 
 
 def test_a_step_turns_no_line_by_more_than_a_quarter_of_a_period():

@@ -13,8 +13,8 @@ from scipy.io import loadmat
 import sysid
 from sysid.cli.main import main
 from sysid.modal_analysis.amplitude_fit import (
-    _envelopes,
     _holding,
+    _in_runs,
     _judged,
     _modes_of,
     _started,
@@ -402,11 +402,11 @@ def test_with_another_exponent_a_law_says_the_same_at_two_levels(test, number, e
     p = replace(fit.parameters, laws=(law,))
     fit = replace(fit, parameters=p)
     other = _with_exponent(fit, number, exponent)
-    levels = np.quantile(np.concatenate(_envelopes(fit, 0, 1)), (0.3, 0.95))
+    levels = np.quantile(np.concatenate(_in_runs(fit, p, law)[0]), (0.3, 0.95))
 
     def at(p, level):
-        (one,), unit = p.laws, level / 400.0
-        a, b = one.values * unit ** np.array(one.form[:2])
+        (one,) = p.laws
+        a, b = one.values * (level / one.form.level) ** np.array(one.form[:2])
         return np.array([p.modes.omega[0] * (1 - a), p.modes.ratios[0] + b])
 
     for level in levels:

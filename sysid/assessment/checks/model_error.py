@@ -254,9 +254,10 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
     asked = context.problem.stated.amplitude
     if asked is None:
         return
-    if not context.modal.laws:
+    stopped = context.modal.stopped and not context.end.structure.laws
+    if stopped or not context.modal.laws:
         why, remedy = "the answer has not the modes that they need", "ask for more modes"
-        if context.modal.stopped:
+        if stopped:
             why, remedy = "the search was stopped", "let it end"
         sentence = f"laws of amplitude are left out, as {why}"
         yield Finding("amplitude open", Severity.CAUTION, sentence, remedy)
@@ -276,7 +277,7 @@ def laws_of_amplitude(context: Context) -> Iterator[Finding]:
                 "amplitude law", Severity.NOTE,
                 f"mode {mode} follows {whose}: from {low:.2g} to {high:.2g} m/s² its frequency changes by "
                 f"{100 * f:.2g} % (+- {100 * LIKELY * std:.2g} %) and its damping ratio by {100 * zeta:.2g} % of "
-                f"critical (+- {100 * LIKELY * of_damping:.2g})", numbers=numbers,
+                f"critical (+- {100 * LIKELY * of_damping:.2g}); at level A they are {law.formula}", numbers=numbers,
             )  # fmt: skip
         elif 4 * (most := abs(f) + LIKELY * std) < law.ratio:  # an eighth of the half-power width
             yield Finding(
