@@ -179,18 +179,18 @@ def find_delays(test: Measurement, beside: BesidePoles | None) -> Delays:
     if not far and first.promise() < beyond_chance(none.values.size) and not complex_.explains_more_than(first):
         return none
     end, complex_ = _settled(first), _settled(complex_, held=True)
-    # Rough poles may lack weak modes, or close ones, which delays of most channels then stand for.
+    # Rough poles may lack weak modes, which delays of most channels then stand for.
     for delays, poles in [*((delays, at.at.poles) for delays, at in far), (complex_.delays, complex_.poles)]:
         other = _settled(_with_one_above(_Late(still, clocks, delays, poles)))
         end = other if other.explains_more_than(end) else end
-    full = _with_further_poles(first)
-    if full.explains_more_than(end) and not (end := _settled(full)).explains_more_than(full):
-        return none
-    # Few modes of a few sensors cost little more than delays: what these leave to complex residues must be chance.
+    # Few modes of a few sensors cost little more than delays: what these leave must be chance.
     open_ = complex_.shows_beyond(end) or not end.explains_more_than(complex_)
     if open_ and not (end := _settled(complex_)).explains_more_than(complex_):
         return none
-    return _found(end, test) or none
+    # Or they lack close ones: then further poles explain more.
+    if (found := _found(end, test)) and (full := _with_further_poles(first)).explains_more_than(end):
+        found = _found(end, test) if (end := _settled(full)).explains_more_than(full) else None
+    return found or none
 
 
 def _clocks(test: Measurement) -> NDArray[np.intp]:
