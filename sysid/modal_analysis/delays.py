@@ -360,10 +360,7 @@ def _with_one_above(fit: _Late, above: float = 1.3) -> _Late:
 
 def _with_further_poles(fit: _Late, most: int = 8) -> _Late:
     """The fit with further poles, so many at most, each where most is left, as long as they explain more."""
-    loss, (first, last) = (
-        np.exp(np.median(fit.poles[fit.omega.size :])),
-        2 * np.pi * fit.test.freq[[0, -1]] * [1.0, 1.3],
-    )
+    loss, (first, last) = float(np.median(fit.ratios)), 2 * np.pi * fit.test.freq[[0, -1]] * [1.0, 1.3]
     at = np.geomspace(first, last, int(np.log(last / first) / loss) + 2)
     functions = fit.records.functions(at, np.full(at.size, loss))
     for _ in range(most):

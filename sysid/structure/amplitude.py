@@ -309,8 +309,10 @@ def motion(
         ``-2 zeta w q' - w² q``, and the level, m/s²; then their derivatives by the initial state, by participations, by
         the numbers, and by those of the given level.
     """
-    first, d = _functions(form)[0], 0 if motions is None else len(motions)
-    given = np.zeros((0, load.size)) if level is None else level
+    # In units of A0: one function serves laws that are alike but for it.
+    top, form, d = form.level, form._replace(level=1.0), 0 if motions is None else len(motions)
+    numbers = numbers - np.log(top) * (np.arange(numbers.size) == 2)
+    first, given = _functions(form)[0], np.zeros((0, load.size)) if level is None else level / top
     state = np.zeros((3, 1 if motions is None else 3 + d + numbers.size + max(len(given) - 1, 0)))
     state[:, :1] = first(initial, numbers)
     beside = []
@@ -330,7 +332,7 @@ def motion(
         buffer.set_arg(i, part)
     buffer.set_res(1, rows.data)
     run()
-    return rows[..., 0].T, rows[..., 1].T
+    return rows[..., 0].T, top * rows[..., 1].T
 
 
 def _next(rows: Array) -> Array:
