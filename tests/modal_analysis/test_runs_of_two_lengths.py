@@ -5,9 +5,11 @@ import pytest
 
 import sysid
 from benchmarks.mistakes.changing import RATE, at_rest, motion, noisy, of_lines
+from sysid.modal_analysis.law_spectra import added_by_laws
 from sysid.modal_analysis.misfit import misfits_of
 from sysid.modal_analysis.outliers import whitened
 from sysid.modal_analysis.residues import Records
+from sysid.structure.amplitude import FittedLaw, LawForm
 
 M, K = np.diag([2.0, 1.0, 0.0]), np.array([[3900.0, -1500, -2400], [-1500, 1500, 0], [-2400, 0, 2400]])
 LENGTHS = 600, 420
@@ -65,3 +67,21 @@ def test_no_more_modes_stand_out_of_five_runs_than_there_are(structure, estimato
     test = sysid.Measurement.from_time(runs, RATE, rigid_body=np.ones((2, 1)), estimator=estimator, band=(0.5, 20.0))
     poles = sysid.Problem(test, mass=sysid.FullMass()).poles
     np.testing.assert_allclose(poles.omega / (2 * np.pi), structure.natural_frequencies, rtol=5e-3)
+
+
+def test_a_law_moves_each_run_of_spectra_as_if_it_were_alone():
+    """Lines of all runs together are finer than those of any: their spacing is no run's."""
+    law = FittedLaw(4.0, 0.02, 0, LawForm(0.5, 1.0, 20.0), np.array([0.1, 0.01]), (0.1, 20.0), np.eye(4), True)
+    stiffness = (2 * np.pi * 4.0) ** 2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    structure = sysid.Structure(np.diag([1.0, 0.0]), stiffness, [0.02], n_base=1, laws=[law])
+    rng, records = np.random.default_rng(0), []
+    for samples in (900, 1000):
+        base = rng.standard_normal((1, samples)) * np.hanning(samples)
+        records.append((base, structure.simulate(base, 100.0), None))
+
+    def added(records):
+        test = sysid.Measurement.from_time(records, 100.0, rigid_body=[[1.0]], estimator="spectra", band=(1.0, 9.0))
+        return [part[:, lines] for part, lines in zip(added_by_laws(test, structure)[0], test.own_lines, strict=True)]
+
+    for one, record in zip(added(records), records, strict=True):
+        np.testing.assert_allclose(one, added([record])[0], rtol=1e-9, atol=1e-12)
