@@ -160,7 +160,7 @@ def _add_lines(total: np.ndarray, modes: Modes, draw: Draw, layout: Layout, run:
     seen = np.zeros((layout.size + 1, len(draw.base_std), w.size), dtype=complex) if noisy else None
     for channel, (at, J) in enumerate(derivatives(modes, draw, layout, run, lines)):
         weighted = J / own[channel] ** 2
-        total[np.ix_(at, at)] += 2 * (J.conj() @ weighted.T).real
+        total[np.ix_(at, at)] += 2 * (J.view(float) @ weighted.view(float).T)
         if seen is not None:
             seen[at] += h[channel].conj() * weighted[:, None]
     if seen is not None:
@@ -168,7 +168,8 @@ def _add_lines(total: np.ndarray, modes: Modes, draw: Draw, layout: Layout, run:
         inner = np.eye(len(draw.base_std)) + np.einsum("cif,c,cjf->fij", h.conj(), own**-2.0, h, optimize=True)
         whitened = np.linalg.solve(np.linalg.cholesky(inner), np.moveaxis(seen, -1, 0).swapaxes(1, 2))
         flat = whitened.reshape(-1, layout.size + 1)
-        total -= 2 * (flat.conj().T @ flat).real
+        parts = np.concatenate([flat.real, flat.imag])  # products of real numbers take an eighth of the time
+        total -= 2 * (parts.T @ parts)
 
 
 def derivatives(

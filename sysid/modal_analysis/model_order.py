@@ -443,7 +443,7 @@ def least_of(fit: RecordFit) -> NDArray[np.bool_]:
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
     value[_of_others(fit)] = np.inf
-    value[no_modes(fit)] = 0.0
+    value[no_modes(fit) & ~_of_others(fit)] = 0.0
     count = int(np.count_nonzero(np.isfinite(value)))  # of which one is left
     first, *others = np.argsort(value, kind="stable")
     gone = (np.arange(m) == first) & (value < least) & (count > 1)

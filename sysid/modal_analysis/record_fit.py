@@ -112,11 +112,10 @@ class RecordFit:
         """Normal equations at the end of the fit, of the model that is `asked`."""
         return self.asked.normal_equations(self.parameters, self.levels)
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """``Re J' S^-1 J`` over all unknowns of the fit."""
-        size = self.model.size
-        return self.equations.normal[:size, :size]
+        return self.model.normal_equations(self.parameters, self.levels).normal
 
     @property
     def freedom(self) -> int:
@@ -385,18 +384,17 @@ class _Equations:
 
     def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
         self.model, self.of_matrix = model, coarse or model
-        self.at: tuple[Parameters, Array] | None = None
+        self.at: tuple[tuple[Parameters, Array], ...] = ()
         self.normal: Array = np.zeros((0, 0))
 
     def __call__(
         self, p: Parameters, levels: Array, near: float = 0.2, known: float = 3.0, none: float = 1e-6
     ) -> NormalEquations:
         """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
-        still = self.at is not None and not self.model.laws  # of laws a gradient takes as long as the matrix
-        if still and self.at is not None and _moved(self.at[0], p) + _largest(levels / self.at[1]) < near:
+        if not self.model.laws and self._off(p, levels) < near:  # of laws a gradient takes as long as the matrix
             return self.model.gradient(p, levels)._replace(normal=self.normal)
         equations = self.of_matrix.normal_equations(p, levels)
-        self.at, self.normal = (p, levels), _without_scale(equations.normal, self.model.scales(p))
+        self.at, self.normal = ((p, levels),), _without_scale(equations.normal, self.model.scales(p))
         hardly = self.model.of_others(p) | (p.modes.ratios < none)
         ratios = np.r_[self.model.index.log_ratios][hardly]
         self.normal[ratios, ratios] = np.maximum(self.normal[ratios, ratios], known**-2)
@@ -418,23 +416,26 @@ class _Equations:
         normal, size = unit_diagonal(here.normal[np.ix_(~held, ~held)])
         return bool(np.sum((half_inverse(normal, ROUND_OFF).T @ (here.gradient[~held] / size)) ** 2) < 10 * _SETTLED)
 
-    def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
-        """The same with the matrix of these very parameters; None where it was."""
-        return None if self.at is not None and self.at[0] is p else self(p, levels, near=0.0)
+    def renewed(self, p: Parameters, levels: Array, near: float = 0.05) -> NormalEquations | None:
+        """The same with the matrix of these very parameters; None where it was of ones that are next to these."""
+        return None if self._off(p, levels) < near else self(p, levels, near=0.0)
+
+    def _off(self, p: Parameters, levels: Array) -> float:
+        """How far these are from the parameters and levels of the matrix, relative; infinite without one."""
+        ends = 2 * np.pi * self.model.test.freq[[0, -1]]
+        return min((_moved(one, p, ends) + _largest(levels / before) for one, before in self.at), default=np.inf)
 
 
-def _moved(before: Parameters, after: Parameters) -> float:
-    """Largest change of any mode: of its frequency over half its half-power width, of its damping ratio and shape.
-
-    And of couplings, over the losses of the modes.
-    """
+def _moved(before: Parameters, after: Parameters, ends: Array) -> float:
+    """Largest change: of a pole over how far it is from the lines (`ends`, rad/s), a shape, a coupling over losses."""
     modes, other = before.modes, after.modes
     loss = np.sqrt(2 * modes.ratios * modes.omega)
     apart = 0.0 if before.coupling is None else np.asarray(after.coupling) - before.coupling
     coupled = np.abs(apart / np.outer(loss, loss)).max()
     turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
-    pole = np.abs(np.log(other.omega / modes.omega)) / modes.ratios
-    return float(max(turned.max(), pole.max(), _largest(other.ratios / modes.ratios), coupled))
+    away = np.hypot(modes.ratios, 1 - np.clip(modes.omega, *ends) / modes.omega)  # relative; half a width, or more
+    pole = np.hypot(np.log(other.omega / modes.omega), modes.ratios * np.log(other.ratios / modes.ratios)) / away
+    return float(max(turned.max(), pole.max(), coupled))
 
 
 def _largest(ratios: Array) -> float:

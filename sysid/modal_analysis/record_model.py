@@ -370,9 +370,9 @@ class Chunk(Lines):
         hidden, covered = np.zeros((columns.unknowns.size,) * 2), self.covered(levels).conj()
         step = 1 + 2**16 // columns.unknowns.size  # lines, of which columns stay in a processor's cache
         for at in range(0, self.run.w.size, step):
-            for part in covered[:, :, at : at + step]:
-                seen = columns.seen(part, spectra[:, at : at + step])
-                hidden += dots(seen, seen)
+            near = slice(at, at + step)
+            seen = np.hstack([columns.seen(part, spectra[:, near]) for part in covered[:, :, near]])
+            hidden += dots(seen, seen)
         cross = dots(spectra, root * weighed.whitened_residual)
         return Sums(dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 

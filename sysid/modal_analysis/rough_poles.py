@@ -24,7 +24,7 @@ _BESIDE = 3  # lines about that of a sine that is cut within a cycle, with most 
 def decimated_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -> NDArray[np.bool_]:
     """Lines that tell the modes where there are many, the last too, (n_freq,).
 
-    So many in a half-power width of a mode of this damping ratio; all of them where that would not save half.
+    So many in a half-power width of a mode of this damping ratio; all of them where that would not save a third.
     """
     keep, ends = np.zeros(test.freq.size, bool), f"{test.freq[0]:g} to {test.freq[-1]:g} Hz"
     refuse((keep.size < 5, f"lines from {ends} ({keep.size}) are too few to tell any mode: add lines, or records"))
@@ -33,7 +33,7 @@ def decimated_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -
         step = np.gradient(test.freq[lines]) / test.freq[lines] * a_width / (2 * ratio)
         at = np.floor(np.cumsum(np.minimum(step, 1.0)))
         keep[lines[np.append(np.flatnonzero(np.diff(at, prepend=-1.0) > 0), -1)]] = True
-    return keep if 2 * np.count_nonzero(keep) < keep.size else np.ones_like(keep)
+    return keep if 3 * np.count_nonzero(keep) < 2 * keep.size else np.ones_like(keep)
 
 
 def at_some_lines(test: Measurement) -> Measurement | None:

@@ -79,7 +79,7 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor, promising: float = 0.
         m, modes = fit.model.m, fit.parameters.modes
         price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
         above = np.count_nonzero(modes.omega > last) - fit.static
-        if above > 2 * max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
+        if above >= 2 * max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
             return fit
         more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, monitor=monitor)
         if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley

@@ -398,7 +398,7 @@ def damping_bounds(problem: Prepared) -> tuple[float, float]:
 
 def _again(
     problem: Prepared, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
-    *, bounded: bool = True, far: float = 2.0,
+    *, bounded: bool = True, far: float = 1.2,
 ) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds.
 

@@ -232,6 +232,15 @@ def test_modes_that_noise_explains_beside_them_are_never_all(fits, monkeypatch):
     assert np.count_nonzero(gone) == np.count_nonzero(within) - 1 and not np.any(gone & ~within)
 
 
+def test_a_pole_above_beside_them_may_be_undamped_and_in_the_lines_it_may_not(fits):
+    """Far narrower than a line it is no mode of the structure, and need be none above the lines."""
+    fit, last = fits[1], 2 * np.pi * fits[1].test.freq[-1]
+    for omega, goes in ((1.4 * last, False), (0.5 * last, True)):
+        p = fit.parameters.at(np.insert(np.arange(fit.model.m), 0, -1))  # a static mode's shape, at a pole of its own
+        p.modes.omega[0], p.modes.ratios[0] = omega, 1e-12
+        assert least_of(replace(fit, parameters=p))[0] == goes
+
+
 @pytest.mark.parametrize("force", [False, True])
 def test_the_unknowns_of_a_model_with_them_are_what_its_normal_matrix_holds(whole, fits, force):
     """Its rank: without the far pole, transients of these modes, turns among them and, without a force, scales."""
