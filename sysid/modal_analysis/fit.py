@@ -61,7 +61,7 @@ from sysid.modal_analysis.rough_poles import (
     steady_sine,
 )
 from sysid.modal_analysis.spectra_modes import strongest_poles
-from sysid.modal_analysis.static_modes import with_static_modes
+from sysid.modal_analysis.static_modes import with_poles_above, with_static_modes
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.nlp import one_thread
 from sysid.structure.amplitude import AmplitudeLaw
@@ -229,8 +229,8 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
         fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
-        monitor.keep(fit)
-        return _with_all_modes(fit, monitor)  # weak ones show on all lines only
+        monitor.keep(fit := with_poles_above(fit, some=some, monitor=monitor) if fit.static else fit)
+        return _with_all_modes(fit, monitor)  # weak ones show on all lines only, and so do poles above
     if first is None:
         first = by_the_noise_found(settled_modes(rough_fit(test, monitor), monitor), monitor)
     return _with_all_modes(first, monitor)

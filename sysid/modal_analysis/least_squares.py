@@ -31,8 +31,7 @@ class SumOfSquares:
     equations : callable
         Normal equations at parameters, by the unknowns.
     renewed : callable
-        The same where their matrix was that of other parameters close by, else None: asked for where a step of some
-        damping fails.
+        The same where their matrix was that of other parameters close by, else None: asked for where a step fails.
     moved : callable
         Unknowns after a step: to first order their sum.
     bent : callable or None
@@ -44,7 +43,7 @@ class SumOfSquares:
     unpack: Callable[[Array], Parameters]
     chi2: Callable[[Parameters], float]
     equations: Callable[[Parameters], NormalEquations]
-    renewed: Callable[[Parameters, float], NormalEquations | None] = lambda *_: None
+    renewed: Callable[[Parameters], NormalEquations | None] = lambda _: None
     moved: Callable[[Array, Array], Array] = np.add
     bent: Callable[[Parameters, Array, Array], Array] | None = None
 
@@ -99,7 +98,7 @@ def minimise(
                 after = problem.chi2(trial)
                 if after <= here.chi2 or promised < enough:
                     break
-            if (renewed := problem.renewed(p, damping)) is not None:
+            if (renewed := problem.renewed(p)) is not None:
                 here = renewed
                 continue
             damping = max(10 * damping, _DAMPING[1])

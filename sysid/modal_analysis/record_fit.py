@@ -367,7 +367,7 @@ def _minimise(
 
     problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
-        lambda at: equations(at, levels), lambda at, damping: equations.renewed(at, levels, damping), model.moved,
+        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
         (lambda at, x, step: model.bent(at, levels, x, step)) if model.static else None,
     )  # fmt: skip
     p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
@@ -416,9 +416,9 @@ class _Equations:
         normal, size = unit_diagonal(here.normal[np.ix_(~held, ~held)])
         return bool(np.sum((half_inverse(normal, ROUND_OFF).T @ (here.gradient[~held] / size)) ** 2) < 10 * _SETTLED)
 
-    def renewed(self, p: Parameters, levels: Array, damping: float, near: float = 0.05) -> NormalEquations | None:
-        """The same with the matrix of these very parameters; None where it was, or of ones so near, damped little."""
-        return None if self._off(p, levels) <= near * (damping < 0.01) else self(p, levels, near=0.0)
+    def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
+        """The same with the matrix of these very parameters; None where it was."""
+        return None if self._off(p, levels) == 0 else self(p, levels, near=0.0)
 
     def _off(self, p: Parameters, levels: Array) -> float:
         """How far these are from the parameters and levels of the matrix, relative; infinite without one."""

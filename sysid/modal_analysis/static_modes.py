@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.modal_fit import STATIC_POLE, Modes, held_gauge
@@ -40,7 +41,7 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     gained = 2 * (more.likelihood - fit.likelihood)
     if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
         return fit
-    return in_gauge(_with_poles_above(more, monitor))
+    return with_poles_above(more, monitor=monitor)
 
 
 def misses_modes_above(fit: RecordFit) -> bool:
@@ -65,12 +66,15 @@ def at_static_pole(fit: RecordFit) -> Parameters:
     return p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
 
 
-def _with_poles_above(fit: RecordFit, monitor: FitMonitor, promising: float = 0.7) -> RecordFit:
+def with_poles_above(
+    fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor, promising: float = 0.7
+) -> RecordFit:  # fmt: skip
     """The fit with further poles between the last line and its static modes, by Akaike's criterion: they are no modes.
 
     See `ModeFit.with_static` of spectra. Where one pole stands for two close modes, what a second one is worth shows
     once both have moved: those that promise this share of their price are tried. Records of many sensors may ask for
-    twice as many as spectra have; with fewer, modes in the lines take on what is missing.
+    twice as many as spectra have; with fewer, modes in the lines take on what is missing. Where lines are many, `some`
+    is the test at a few of them, as in `refitted`.
     """
     last, far = 2 * np.pi * fit.test.freq[-1] * np.array([1.0, STATIC_POLE[0]])
     near = last, np.sqrt(last * far)  # from further away a pole would go where the static modes are
@@ -80,14 +84,14 @@ def _with_poles_above(fit: RecordFit, monitor: FitMonitor, promising: float = 0.
         price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
         above = np.count_nonzero(modes.omega > last) - fit.static
         if above >= 2 * max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
-            return fit
-        more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, monitor=monitor)
+            return in_gauge(fit)
+        more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, some=some, monitor=monitor)
         if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley
-            more = refitted(more, more.parameters, limits=TRIAL._replace(rounds=24), monitor=monitor)
+            more = refitted(more, more.parameters, limits=TRIAL._replace(rounds=24), some=some, monitor=monitor)
         omega = more.parameters.modes.omega[: -fit.static]
         stays = np.count_nonzero(omega < last) == np.count_nonzero(modes.omega < last)
         if not (more.settled and stays and np.all(omega < far) and more.likelihood - fit.likelihood > price):
-            return fit
+            return in_gauge(fit)
         fit = more
 
 
