@@ -229,7 +229,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         fit = _white_fit(some, monitor, first)
         monitor.doing = "all lines"
         fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
-        monitor.keep(fit := with_poles_above(fit, some=some, monitor=monitor) if fit.static else fit)
+        monitor.keep(fit := with_poles_above(fit, some=some, monitor=monitor))
         return _with_all_modes(fit, monitor)  # weak ones show on all lines only, and so do poles above
     if first is None:
         first = by_the_noise_found(settled_modes(rough_fit(test, monitor), monitor), monitor)

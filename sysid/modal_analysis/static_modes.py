@@ -66,15 +66,12 @@ def at_static_pole(fit: RecordFit) -> Parameters:
     return p.with_modes(modes, np.vstack([p.ends, np.zeros((d, p.ends.shape[1]))]))
 
 
-def with_poles_above(
-    fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor, promising: float = 0.7
-) -> RecordFit:  # fmt: skip
+def with_poles_above(fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor) -> RecordFit:
     """The fit with further poles between the last line and its static modes, by Akaike's criterion: they are no modes.
 
     See `ModeFit.with_static` of spectra. Where one pole stands for two close modes, what a second one is worth shows
-    once both have moved: those that promise this share of their price are tried. Records of many sensors may ask for
-    twice as many as spectra have; with fewer, modes in the lines take on what is missing. Where lines are many, `some`
-    is the test at a few of them, as in `refitted`.
+    once both have moved: those that promise seven tenths of their price are tried. Records of many sensors may ask for
+    twice as many as spectra have; with fewer, modes in the lines take on what is missing. `some` is as in `refitted`.
     """
     last, far = 2 * np.pi * fit.test.freq[-1] * np.array([1.0, STATIC_POLE[0]])
     near = last, np.sqrt(last * far)  # from further away a pole would go where the static modes are
@@ -82,8 +79,8 @@ def with_poles_above(
     while True:
         m, modes = fit.model.m, fit.parameters.modes
         price = fit.model_of(fit.parameters.at(np.append(np.arange(m), 0))).unknowns - fit.model.unknowns
-        above = np.count_nonzero(modes.omega > last) - fit.static
-        if above >= 2 * max(fit.test.n_base, 2) or not (peaks := peaks_of(fit, promising * price, within=near)):
+        full = np.count_nonzero(modes.omega > last) - fit.static >= 2 * max(fit.test.n_base, 2)
+        if not fit.static or full or not (peaks := peaks_of(fit, 0.7 * price, within=near)):
             return in_gauge(fit)
         more = refitted(fit, with_peak(fit, fit.parameters, peaks[0]), limits=TRIAL, some=some, monitor=monitor)
         if not more.settled and more.likelihood - fit.likelihood > price:  # it creeps along a flat valley
