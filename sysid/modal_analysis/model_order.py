@@ -442,8 +442,8 @@ def least_of(fit: RecordFit) -> NDArray[np.bool_]:
     """Modes that noise explains, all together: the one that explains least and those next to it, (m,); never all."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
+    value[no_modes(fit)] = 0.0
     value[_of_others(fit)] = np.inf
-    value[no_modes(fit) & ~_of_others(fit)] = 0.0
     count = int(np.count_nonzero(np.isfinite(value)))  # of which one is left
     first, *others = np.argsort(value, kind="stable")
     gone = (np.arange(m) == first) & (value < least) & (count > 1)

@@ -418,7 +418,7 @@ class _Equations:
 
     def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
         """The same with the matrix of these very parameters; None where it was."""
-        return None if self._off(p, levels) == 0 else self(p, levels, near=0.0)
+        return None if any(one is p and old is levels for one, old in self.at) else self(p, levels, near=0.0)
 
     def _off(self, p: Parameters, levels: Array) -> float:
         """How far these are from the parameters and levels of the matrix, relative; infinite without one."""
