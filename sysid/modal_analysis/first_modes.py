@@ -14,7 +14,7 @@ from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.misfit import deviations
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import least_of, pruned
-from sysid.modal_analysis.record_fit import ROUGH, TRIAL, RecordFit, on_turned, record_modes, refitted, without
+from sysid.modal_analysis.record_fit import ROUGH, TRIAL, Limits, RecordFit, on_turned, record_modes, refitted, without
 from sysid.modal_analysis.residual_tests import delays_beside_dampers, left_of_clocks, with_shared_clocks
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
@@ -29,8 +29,12 @@ def first_modes(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[
     """
     some = without_delays(test.at(decimated_lines(test)), delays)
     try:
-        first = settled_modes(rough_fit(some, monitor), monitor)
-        if not np.any(late := _newly_late(first, delays, monitor, 25.0)):
+        first = near_fit(some, monitor)
+        late = _newly_late(first, delays, monitor, 25.0)
+        if np.any(late) and not first.settled:  # what is left to settle may look so
+            first = settled_modes(first, monitor)
+            late = _newly_late(first, delays, monitor, 25.0)
+        if not np.any(late):
             first = by_the_noise_found(first, monitor)
             late = _newly_late(first, delays, monitor, 5.0)
     except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
@@ -68,12 +72,15 @@ def price_of_delays(total: Array, delays: Array, fit: RecordFit) -> float:
 
 
 def by_the_noise_found(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
-    """The fit, or that of poles looked for once more, by its noise, where it is better."""
+    """The fit, or that of poles looked for once more, by its noise, where it is better; settled."""
     monitor.doing, test = "poles by the noise found", fit.test
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if same_modes(fit.parameters.modes, again):
-        return fit
-    return max(fit, settled_modes(_with_poles(test, again, monitor), monitor, beside=fit), key=lambda one: one.schwarz)
+        return settled_modes(fit, monitor)
+    found = _with_poles(test, again, monitor, first=True)
+    beside = (found.schwarz > fit.schwarz and fit) or settled_modes(fit, monitor)
+    found = settled_modes(found, monitor, beside=beside)
+    return settled_modes(max(beside, found, key=lambda one: one.schwarz), monitor)
 
 
 def rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
@@ -82,10 +89,18 @@ def rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     return _with_poles(test, find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor), monitor)
 
 
-def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
+def near_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
+    """The same, near enough for the noise: where modes are missing two that are one would move along until the end."""
+    fit, near = rough_fit(test, monitor), Limits(6, 60, creeping=1.0)
+    fit = pruned(refitted(fit, fit.parameters, limits=near, monitor=monitor), monitor, limits=near)
+    monitor.keep(fit)
+    return fit
+
+
+def _with_poles(test: Measurement, poles: Poles, monitor: FitMonitor, *, first: bool = False) -> RecordFit:
     """One mode at each pole, roughly, without those that noise explains; further ones at a pole show in its errors."""
     monitor.doing = f"{poles.omega.size} modes"
-    return pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH)
+    return pruned(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor, limits=ROUGH, first=first)
 
 
 def settled_modes(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None = None) -> RecordFit:
@@ -100,9 +115,9 @@ def settled_modes(fit: RecordFit, monitor: FitMonitor, beside: RecordFit | None 
         fit = refitted(fit, fit.parameters, limits=TRIAL, monitor=monitor)
         fewer = min(fit.model.unknowns - beside.model.unknowns, 0)  # further modes may go, and add no likelihood
         worse = fit.likelihood - fewer * np.log(fit.model.numbers) / 2 < beside.likelihood
-        if worse or (fit.model.m > beside.model.m and leads_to(beside, without(fit, least_of(fit)).modes)):
+        if worse or (fit.model.m > beside.model.m and leads_to(beside, without(fit, least_of(fit, first=True)).modes)):
             return beside
-    fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor)
+    fit = pruned(fit if fit.settled else refitted(fit, fit.parameters, monitor=monitor), monitor, first=True)
     monitor.keep(fit)
     return fit
 

@@ -16,7 +16,7 @@ from sysid.modal_analysis.calibration import Calibration, calibrated
 from sysid.modal_analysis.coupled_modes import coupling_of, with_couplings
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.direct_terms import without_window
-from sysid.modal_analysis.first_modes import by_the_noise_found, first_modes, price_of_delays, rough_fit, settled_modes
+from sysid.modal_analysis.first_modes import by_the_noise_found, first_modes, near_fit, price_of_delays, rough_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.growing_errors import errors_grow, may_grow, with_profile
 from sysid.modal_analysis.misfit import left_of, misses_much, without_transients
@@ -24,6 +24,7 @@ from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.model_order import (
     least_worth,
+    no_modes,
     peaks_of,
     pruned,
     with_further_modes,
@@ -232,7 +233,7 @@ def _white_fit(test: Measurement, monitor: FitMonitor, first: RecordFit | None =
         monitor.keep(fit := with_poles_above(fit, some=some, monitor=monitor))
         return _with_all_modes(fit, monitor)  # weak ones show on all lines only, and so do poles above
     if first is None:
-        first = by_the_noise_found(settled_modes(rough_fit(test, monitor), monitor), monitor)
+        first = by_the_noise_found(near_fit(test, monitor), monitor)
     return _with_all_modes(first, monitor)
 
 
@@ -240,6 +241,8 @@ def _with_all_modes(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     """The fit with couplings, then further modes that are worth it, without spurious ones."""
     some = at_some_lines(fit.test)
     fit = with_couplings(fit, lambda rough: pruned(rough, monitor, limits=ROUGH), some=some, monitor=monitor)
+    if np.any(no_modes(fit) & ~no_modes(fit, first=True)):  # first ones above the lines, which stand for others there
+        fit = pruned(with_static_modes(fit, monitor=monitor), monitor)
     monitor.keep(fit)
     if fit.model.whole.grows and 2 * len(peaks_of(fit, least_worth(fit.model))) > fit.model.m:
         return fit  # levels and shares do not explain what is left, and further modes would take long

@@ -136,6 +136,14 @@ def unit_diagonal(normal: Array) -> tuple[Array, Array]:
     return normal / np.outer(size, size), size
 
 
+def held_along(normal: Array, moves: Array) -> Array:
+    """A normal matrix (p, p) with moves (k, p) that change nothing held at zero."""
+    unit = units_of(normal)
+    rows = np.divide(moves, unit, out=np.zeros_like(moves), where=unit > 0)
+    rows = np.divide(rows / np.linalg.norm(rows, axis=1, keepdims=True), unit, out=np.zeros_like(rows), where=unit > 0)
+    return normal + rows.T @ rows
+
+
 def half_inverse(normal: Array, least: float) -> Array:
     """H with ``H H'`` the inverse of a scaled normal matrix, but for what shows by less than `least` of the most."""
     lam, V = np.linalg.eigh(normal)

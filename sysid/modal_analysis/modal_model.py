@@ -91,6 +91,11 @@ class NormalEquations(NamedTuple):
         """Those of some of the unknowns, the others held."""
         return self._replace(normal=self.normal[unknowns][:, unknowns], gradient=self.gradient[unknowns])
 
+    def holding(self, unknowns: NDArray[np.bool_]) -> NormalEquations:
+        """The same where some unknowns, (p,), are held: they show nowhere."""
+        free = ~unknowns
+        return self._replace(normal=self.normal * np.outer(free, free), gradient=self.gradient * free)
+
 
 @dataclass(frozen=True, eq=False)
 class Columns:

@@ -116,15 +116,17 @@ def with_so_many_modes(fit: RecordFit, count: int, ours: NDArray[np.bool_]) -> R
     return replace(fit, kept=~gone) if np.any(gone) else fit
 
 
-def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
+def no_modes(fit: RecordFit, *, first: bool = False) -> NDArray[np.bool_]:
     """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line.
 
-    And for those that drift makes: of less than two periods a record, or of four below the lines.
+    And for those that drift makes: of less than two periods a record, or of four below the lines. Those above the lines
+    may be so narrow among `first` ones: they stand for others, and what takes their place comes later.
     """
     modes, line = fit.parameters.modes, 2 * np.pi * np.min(fit.model.whole.spacing)
     below = modes.omega < 2 * np.pi * fit.test.freq[0]
     slow = (modes.omega < np.where(below, 4, 2) * line) & (not fit.model.whole.grows)
-    return np.asarray((modes.ratios >= DAMPED) | (modes.ratios * modes.omega < RAZOR * line) | slow)
+    narrow = (modes.ratios * modes.omega < RAZOR * line) & ~(first & (modes.omega > 2 * np.pi * fit.test.freq[-1]))
+    return np.asarray((modes.ratios >= DAMPED) | narrow | slow)
 
 
 def least_worth(model: RecordModel) -> float:
@@ -386,14 +388,14 @@ def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Ar
 
 
 def pruned(
-    fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE, many: float = 100.0
+    fit: RecordFit, monitor: FitMonitor | None, *, limits: Limits = WHOLE, many: float = 100.0, first: bool = False
 ) -> RecordFit:  # fmt: skip
-    """The fit without modes that noise explains, several together where noise explains them all.
+    """The fit without modes that noise explains, several together where noise explains them all; `first` ones or all.
 
     Where likelihood falls by `many` times what noise explains, a mode within the width of another one had cancelled
     much of it: then the two begin as one, too.
     """
-    while np.any(least := least_of(fit)):
+    while np.any(least := least_of(fit, first=first)):
         fewer = refitted(fit, without(fit, least), limits=limits, monitor=monitor)
         fell = fit.likelihood - fewer.likelihood > many * least_worth(fit.model)
         if fell and (start := _with_one_as_another(fit, least)):
@@ -438,15 +440,15 @@ def _of_others(fit: RecordFit) -> NDArray[np.bool_]:
     return fit.model.of_others(fit.parameters) | (np.arange(fit.model.m) >= fit.model.m - fit.static)
 
 
-def least_of(fit: RecordFit) -> NDArray[np.bool_]:
+def least_of(fit: RecordFit, *, first: bool = False) -> NDArray[np.bool_]:
     """Modes that noise explains, all together: the one that explains least and those next to it, (m,); never all."""
     rise, least, m = joint_worth(fit), least_worth(fit.model), fit.model.m
     value = np.array([rise(one) for one in np.eye(m, dtype=bool)])
-    value[no_modes(fit)] = 0.0
+    value[no_modes(fit, first=first)] = 0.0
     value[_of_others(fit)] = np.inf
     count = int(np.count_nonzero(np.isfinite(value)))  # of which one is left
-    first, *others = np.argsort(value, kind="stable")
-    gone = (np.arange(m) == first) & (value < least) & (count > 1)
+    lowest, *others = np.argsort(value, kind="stable")
+    gone = (np.arange(m) == lowest) & (value < least) & (count > 1)
     for k in others[: max(count - 2, 0)]:
         more = gone | (np.arange(m) == k)
         if value[k] >= least or rise(more) >= least:

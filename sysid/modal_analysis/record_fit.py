@@ -19,7 +19,7 @@ from sysid.measurement.channels import without_constants
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, SteadyLines
 from sysid.modal_analysis.fit_monitor import FitMonitor
-from sysid.modal_analysis.least_squares import SumOfSquares, half_inverse, minimise, unit_diagonal, units_of
+from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.modal_fit import Modes, weigh
 from sysid.modal_analysis.modal_model import ModeLaw, trace_count
 from sysid.modal_analysis.noise_levels import (
@@ -31,22 +31,26 @@ from sysid.modal_analysis.noise_levels import (
     rough_levels,
 )
 from sysid.modal_analysis.record_model import NormalEquations, Parameters, RecordModel
+from sysid.modal_analysis.record_steps import KeptEquations, minimised
 from sysid.modal_analysis.residues import Records
 from sysid.structure.amplitude import FittedLaw, LawForm, laws_from_tree, laws_to_tree
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF
 
-_SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
 
 class Limits(NamedTuple):
-    """Limits of a fit: rounds of modes and levels in turn, steps of each, further rounds where levels alone move."""
+    """Limits of a fit: rounds of modes and levels in turn, steps of each, further rounds where levels alone move.
+
+    Steps of a round end, too, where one gains less than `creeping`: then the fit is not settled.
+    """
 
     rounds: int
     steps: int
     further: int = 0
+    creeping: float = 0.0
 
 
 WHOLE, TRIAL, ROUGH = Limits(12, 60, 12), Limits(12, 8), Limits(3, 4)
@@ -319,12 +323,12 @@ def fit_model(
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = rough_levels(model, p)
-    settled, chi2, equations = False, np.inf, _Equations(model, coarse)
+    settled, chi2, equations = False, np.inf, KeptEquations(model, coarse)
     for round_ in range(limits.rounds + limits.further):
         if round_ and model.whole.grows:  # held within a round: varying without log det it would bias the modes
             model = model.at_signal(p)
-            equations = _Equations(model, coarse and coarse.at_signal(p))
-        p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), equations)
+            equations = KeptEquations(model, coarse and coarse.at_signal(p))
+        p, chi2, done = minimised(model, p, levels, monitor, (10 * round_, limits.steps), equations, limits.creeping)
         if stated is not None:
             settled = done
             break
@@ -339,116 +343,6 @@ def fit_model(
     if stated is None:
         chi2 = model.at_signal(p).chi2(p, levels)  # at the last levels
     return RecordFit(test, p, levels, chi2, settled, static=model.static)
-
-
-def _minimise(
-    model: RecordModel,
-    p: Parameters,
-    levels: Array,
-    monitor: FitMonitor,
-    counts: tuple[int, int],
-    equations: _Equations,
-    creeping: float = 1.0,
-) -> tuple[Parameters, float, bool]:
-    """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most.
-
-    Beside static modes others above the lines are no modes of the structure, and follow flat valleys: where a step
-    gains less than `creeping`, which no criterion would tell from none, the end need not be theirs.
-    """
-    done, most = counts
-
-    before = np.inf
-
-    def tell(i: int, at: Parameters, chi2: float) -> bool:
-        nonlocal before
-        monitor(done + i, float(np.sqrt(2 * chi2 / model.numbers)))
-        creeps, before = model.static > 0 and before - chi2 < creeping, chi2
-        return creeps and equations.still_in_lines(at, levels)
-
-    problem = SumOfSquares(
-        model.pack(p), model.unpack, lambda trial: model.trial_chi2(trial, levels),
-        lambda at: equations(at, levels), lambda at: equations.renewed(at, levels), model.moved,
-        (lambda at, x, step: model.bent(at, levels, x, step)) if model.static else None,
-    )  # fmt: skip
-    p, chi2, ended = minimise(problem, tell, most, lambda _: _SETTLED)
-    return p, chi2, ended or (model.static > 0 and equations.still_in_lines(p, levels))
-
-
-class _Equations:
-    """Normal equations of one fit; their matrix is kept as long as parameters and levels hardly move.
-
-    Gradients, which decide where the fit ends, are always exact; they take a small part of the matrix's time. The
-    logarithm of a damping ratio that is next to `none`, or above the lines beside static modes, counts as known to
-    `known` at least: it hardly shows, and a long step of it would be refused with those of all others.
-    """
-
-    def __init__(self, model: RecordModel, coarse: RecordModel | None) -> None:
-        self.model, self.of_matrix = model, coarse or model
-        self.at: tuple[tuple[Parameters, Array], ...] = ()
-        self.normal: Array = np.zeros((0, 0))
-
-    def __call__(
-        self, p: Parameters, levels: Array, near: float = 0.2, known: float = 3.0, none: float = 1e-6
-    ) -> NormalEquations:
-        """At these parameters and levels; the matrix of ones so `near`, relative, or from a coarser model."""
-        if not self.model.laws and self._off(p, levels) < near:  # of laws a gradient takes as long as the matrix
-            return self.model.gradient(p, levels)._replace(normal=self.normal)
-        equations = self.of_matrix.normal_equations(p, levels)
-        self.at, self.normal = ((p, levels),), _without_scale(equations.normal, self.model.scales(p))
-        hardly = self.model.of_others(p) | (p.modes.ratios < none)
-        ratios = np.r_[self.model.index.log_ratios][hardly]
-        self.normal[ratios, ratios] = np.maximum(self.normal[ratios, ratios], known**-2)
-        if self.of_matrix is not self.model:
-            equations = self.model.gradient(p, levels)
-        return equations._replace(normal=self.normal)
-
-    def still_in_lines(self, p: Parameters, levels: Array) -> bool:
-        """True where a step promises no fall of the sum of squares while modes above the lines stay as they are."""
-        here, model = self(p, levels), self.model
-        index, stays = model.index, model.of_others(p)
-        stays |= (np.arange(model.m) >= model.m - model.static) & (p.coupling is not None)  # dampers alone move these
-        held = np.zeros(model.size, bool)
-        held[index.phi] = np.tile(stays, model.n)
-        held[index.gamma] = np.repeat(stays, model.d)
-        held[index.log_omega] = held[index.log_ratios] = stays
-        held[model.kept : model.kept + model.n_ends] = np.repeat(stays, model.n_ends // model.m)
-        held[model.coupling] = np.any(stays[model.coupled], axis=1)
-        normal, size = unit_diagonal(here.normal[np.ix_(~held, ~held)])
-        return bool(np.sum((half_inverse(normal, ROUND_OFF).T @ (here.gradient[~held] / size)) ** 2) < 10 * _SETTLED)
-
-    def renewed(self, p: Parameters, levels: Array) -> NormalEquations | None:
-        """The same with the matrix of these very parameters; None where it was."""
-        return None if any(one is p and old is levels for one, old in self.at) else self(p, levels, near=0.0)
-
-    def _off(self, p: Parameters, levels: Array) -> float:
-        """How far these are from the parameters and levels of the matrix, relative; infinite without one."""
-        ends = 2 * np.pi * self.model.test.freq[[0, -1]]
-        return min((_moved(one, p, ends) + _largest(levels / before) for one, before in self.at), default=np.inf)
-
-
-def _moved(before: Parameters, after: Parameters, ends: Array) -> float:
-    """Largest change: of a pole over how far it is from the lines (`ends`, rad/s), a shape, a coupling over losses."""
-    modes, other = before.modes, after.modes
-    loss = np.sqrt(2 * modes.ratios * modes.omega)
-    apart = 0.0 if before.coupling is None else np.asarray(after.coupling) - before.coupling
-    coupled = np.abs(apart / np.outer(loss, loss)).max()
-    turned = np.abs(other.phi - modes.phi).max(axis=0) / np.abs(modes.phi).max(axis=0)
-    away = np.hypot(modes.ratios, 1 - np.clip(modes.omega, *ends) / modes.omega)  # relative; half a width, or more
-    pole = np.hypot(np.log(other.omega / modes.omega), modes.ratios * np.log(other.ratios / modes.ratios)) / away
-    return float(max(turned.max(), pole.max(), coupled))
-
-
-def _largest(ratios: Array) -> float:
-    """Largest change by a ratio."""
-    return float(np.abs(np.log(ratios)).max())
-
-
-def _without_scale(normal: Array, scales: Array) -> Array:
-    """A normal matrix (p, p) that holds moves along `scales` (k, p), which change nothing, at zero."""
-    unit = units_of(normal)
-    rows = np.divide(scales, unit, out=np.zeros_like(scales), where=unit > 0)
-    rows = np.divide(rows / np.linalg.norm(rows, axis=1, keepdims=True), unit, out=np.zeros_like(rows), where=unit > 0)
-    return normal + rows.T @ rows
 
 
 def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:

@@ -36,12 +36,18 @@ def with_static_modes(fit: RecordFit, *, monitor: FitMonitor | None = None) -> R
     passed = lambda one: one.parameters.modes.omega > far * (1 + ROUND_OFF)  # noqa: E731
     if np.any(passed(more)):  # they stand for what the static modes do
         more = refitted(more, without(more, passed(more)), monitor=monitor)
-    unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
     inside = [np.count_nonzero(one.parameters.modes.omega < 2 * np.pi * test.freq[-1]) for one in (fit, more)]
-    gained = 2 * (more.likelihood - fit.likelihood)
-    if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or gained < beyond_chance(unknowns):
+    whole = more.model.m - d == fit.model.m  # else a pole for many went, and a nearer one may have to take its place
+    if not more.settled or np.any(passed(more)) or inside[0] != inside[1] or (whole and not _explains(more, fit)):
         return fit
-    return with_poles_above(more, monitor=monitor)
+    more = with_poles_above(more, monitor=monitor)
+    return more if _explains(more, fit) else fit
+
+
+def _explains(more: RecordFit, fit: RecordFit) -> bool:
+    """True where a fit of more unknowns gains more than chance."""
+    unknowns = max(more.model.unknowns - fit.model.unknowns, 1)
+    return 2 * (more.likelihood - fit.likelihood) >= beyond_chance(unknowns)
 
 
 def misses_modes_above(fit: RecordFit) -> bool:

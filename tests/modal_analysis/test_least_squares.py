@@ -1,5 +1,7 @@
 """Damped Gauss-Newton steps beside problems whose end is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,14 @@ def test_a_curved_valley_is_followed_to_its_end():
 
 def test_bent_steps_are_fewer():
     assert 2 * steps_of(valley(bent=True))[1] < steps_of(valley(bent=False))[1]
+
+
+def test_an_unknown_that_is_held_stays_while_the_other_one_settles_beside_it():
+    free, held = valley(bent=True), np.array([True, False])
+    start = np.array([-1.5, 0.3])
+    problem = replace(free, start=start, equations=lambda x: free.equations(x).holding(held))
+    x, _, settled = minimise(problem, lambda *_: False, 100, lambda _: 1e-16)
+    assert settled and x[0] == start[0] and x[1] == pytest.approx(start[0] ** 2)
 
 
 def test_a_score_over_the_root_of_the_rest_is_that_of_all_eigenvalues() -> None:

@@ -23,7 +23,7 @@ from sysid.modal_analysis.model_order import (
     worth,
 )
 from sysid.modal_analysis.noise_levels import ErrorSpectra, _likelihood
-from sysid.modal_analysis.record_fit import ROUGH, as_one, record_modes, refitted
+from sysid.modal_analysis.record_fit import ROUGH, Limits, as_one, record_modes, refitted
 
 RATE, SECONDS = 40.0, 40.0
 REACH = 15.0  # half-power widths
@@ -133,6 +133,14 @@ def test_a_pole_above_the_lines_without_damping_holds_no_other_mode(fit_of_two):
     again = refitted(fit, p)
     assert again.likelihood > fit.likelihood - 1.0
     assert again.parameters.modes.omega[:-1] == pytest.approx(modes.omega, rel=1e-4)
+
+
+def test_steps_end_where_one_gains_less_than_it_must(fit_of_two):
+    fit, _ = fit_of_two
+    modes = fit.parameters.modes
+    p = fit.parameters.with_modes(modes._replace(omega=1.002 * modes.omega), fit.parameters.ends)
+    ends = [refitted(fit, p, limits=Limits(1, *one)) for one in ((60, 0, 1e12), (1, 0, 0.0), (60, 0, 0.0))]
+    assert ends[0].likelihood == ends[1].likelihood < ends[2].likelihood and not ends[0].settled
 
 
 def test_worth_is_the_schur_complement_of_all_else(fit_of_two):

@@ -234,11 +234,37 @@ def test_modes_that_noise_explains_beside_them_are_never_all(fits, monkeypatch):
 
 def test_a_pole_above_beside_them_may_be_undamped_and_in_the_lines_it_may_not(fits):
     """Far narrower than a line it is no mode of the structure, and need be none above the lines."""
-    fit, last = fits[1], 2 * np.pi * fits[1].test.freq[-1]
-    for omega, goes in ((1.4 * last, False), (0.5 * last, True)):
-        p = fit.parameters.at(np.insert(np.arange(fit.model.m), 0, -1))  # a static mode's shape, at a pole of its own
-        p.modes.omega[0], p.modes.ratios[0] = omega, 1e-12
-        assert least_of(replace(fit, parameters=p))[0] == goes
+    last = 2 * np.pi * fits[1].test.freq[-1]
+    assert not least_of(with_undamped(fits[1], 1.4 * last))[0]
+    assert least_of(with_undamped(fits[1], 0.5 * last))[0]
+
+
+def with_undamped(fit, omega):
+    """With a first mode of this frequency and no damping, whose shape is that of the last one."""
+    p = fit.parameters.at(np.insert(np.arange(fit.model.m), 0, -1))
+    p.modes.omega[0], p.modes.ratios[0] = omega, 1e-12
+    return replace(fit, parameters=p)
+
+
+def test_an_undamped_pole_above_stays_among_first_modes_until_static_ones_take_its_place(fits, monkeypatch):
+    first = with_undamped(fits[0], 1.4 * 2 * np.pi * fits[0].test.freq[-1])
+    assert least_of(first)[0] and not least_of(first, first=True)[0]
+    monkeypatch.setattr("sysid.modal_analysis.fit.misses_much", lambda left: False)
+    monkeypatch.setattr("sysid.modal_analysis.fit.with_couplings", lambda fit, *_, **__: fit)
+    asked = []
+
+    def with_static_modes(of, **_):
+        asked.append(of)
+        return fits[1]
+
+    monkeypatch.setattr("sysid.modal_analysis.fit.with_static_modes", with_static_modes)
+    assert fit._with_all_modes(first, FitMonitor()).static == 2 and asked == [first]
+
+
+def test_static_modes_are_judged_with_the_poles_beside_them():
+    """Six modes in the lines of a plate; a pole that stood for many above went, and static modes alone miss more."""
+    truth = continuous_structure(29)
+    assert fit.with_static_modes(fit.whole_fit(draw(truth).measurement)).static == 1
 
 
 @pytest.mark.parametrize("force", [False, True])
