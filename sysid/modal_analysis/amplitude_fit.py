@@ -19,7 +19,7 @@ from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, as_one, refitted, rough_levels
 from sysid.modal_analysis.residues import line_correlation
-from sysid.structure.amplitude import OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
+from sysid.structure.amplitude import MOST_DAMPED, OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import ROUND_OFF, beyond_chance
 
@@ -66,6 +66,8 @@ def _stages(
     if plain:
         monitor.doing = "least squares"
         linear = refitted(linear, linear.parameters, monitor=monitor)
+        while np.any(flat := _without_peak(linear)):  # what it explains a law is to explain
+            linear = refitted(linear, linear.parameters.at(~flat), monitor=monitor)
     modes, best = _modes_of(linear, stated), linear
     if fit.parameters.coupling is not None:  # dampers may couple modes, or what changes passes for it
         best = refitted(linear, replace(linear.parameters, coupling=None), limits=ROUGH, monitor=monitor)
@@ -128,7 +130,7 @@ def _with_law_of(
             started.append(_started(*begun, first, falls, limits, monitor))
         if max(one.schwarz for one in started) > best.schwarz:
             break
-    best = max(started, key=lambda one: one.schwarz)
+    best = _without_doubles(max(started, key=lambda one: one.schwarz), limits, monitor)
     yield best
     alone = best.parameters.laws[-1].level_of is None  # what follows another changes by the same cause
     for number, each in enumerate((OF_FREQUENCY, OF_DAMPING) if exponents == "auto" and alone else ()):
@@ -136,25 +138,47 @@ def _with_law_of(
             monitor.doing = f"{which}, exponent {exponent:g} {LawForm._fields[number].replace('_', ' ')}"
             found = refitted(best, _with_exponent(best, number, exponent), limits=limits, monitor=monitor)
             best = max(best, found, key=lambda one: one.likelihood)
+        best = _without_doubles(best, limits, monitor)
         yield best
 
 
+def _without_peak(fit: RecordFit) -> NDArray[np.bool_]:
+    """True of modes in the lines that are damped too much to show in them, (m,); of none where all are."""
+    modes = fit.parameters.modes
+    damped = (modes.ratios > MOST_DAMPED) & (modes.omega < 2 * np.pi * fit.test.freq[-1])
+    return damped & ~np.all(damped)
+
+
+def _without_doubles(fit: RecordFit, limits: Limits, monitor: FitMonitor) -> RecordFit:
+    """The fit without modes of the shape of the last that has a law, where they stood for what the law explains."""
+    number = fit.parameters.laws[-1].mode
+    for k in np.flatnonzero(_without_law(fit) & _like(fit.parameters.modes, number))[::-1]:
+        fewer = refitted(fit, fit.parameters.at(np.arange(fit.model.m) != k), limits=limits, monitor=monitor)
+        fit = fit if _is_likelier(fit, fewer, fit.model.unknowns - fewer.model.unknowns) else fewer
+    return fit
+
+
 def _judged(fit: RecordFit, others: Sequence[RecordFit]) -> RecordFit:
-    """The fit, whose last laws are told to be likelier than the fits without each of them, or not, beyond chance.
+    """The fit, whose last laws are told to be likelier than the fits without each of them, or not, beyond chance."""
+    p, first = fit.parameters, len(fit.parameters.laws) - len(others)
+    laws = list(p.laws[:first])
+    for law, without in zip(p.laws[first:], others, strict=True):
+        laws.append(law._replace(likelier=_is_likelier(fit, without, law.form.size)))
+    return replace(fit, parameters=replace(p, laws=tuple(laws)))
+
+
+def _is_likelier(fit: RecordFit, without: RecordFit, freedom: int) -> bool:
+    """True of a fit that is likelier than one without so many of its numbers, beyond chance.
 
     Squares take the base as exact, and what its noise does at a few lines near a peak passes for what a law does: there
     the gain must also be beyond its scatter from line to line (Vuong, Econometrica 57 (1989) 307-333).
     """
-    p, first = fit.parameters, len(fit.parameters.laws) - len(others)
-    laws = list(p.laws[:first])
-    for law, without in zip(p.laws[first:], others, strict=True):
-        gained = 2 * (fit.likelihood - without.likelihood) / _shared(fit)
-        likelier = gained > beyond_chance(law.form.size, len(OF_FREQUENCY) + len(OF_DAMPING))
-        if likelier and fit.model.whole.plain:
-            each = _of_lines(fit) - _of_lines(without)
-            likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
-        laws.append(law._replace(likelier=likelier))
-    return replace(fit, parameters=replace(p, laws=tuple(laws)))
+    gained = 2 * (fit.likelihood - without.likelihood) / _shared(fit)
+    likelier = gained > beyond_chance(freedom, len(OF_FREQUENCY) + len(OF_DAMPING))
+    if likelier and fit.model.whole.plain:
+        each = _of_lines(fit) - _of_lines(without)
+        likelier = float(np.sum(each) ** 2 / np.sum(each**2)) > beyond_chance(1)
+    return bool(likelier)
 
 
 def _holding(

@@ -1,17 +1,17 @@
 """Laws of amplitude as a term of the model of whole records: exact derivatives, and what records tell of them."""
 
-import math
 from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.linalg
-import scipy.signal
 from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
+from sysid.jobs import JobResult, spreads
+from sysid.jobs.score import scored
 from sysid.modal_analysis.amplitude_fit import (
     _holding,
     _in_runs,
@@ -20,6 +20,7 @@ from sysid.modal_analysis.amplitude_fit import (
     _started,
     _with_exponent,
     _without,
+    _without_doubles,
     fitted_laws,
     with_laws,
 )
@@ -30,108 +31,24 @@ from sysid.modal_analysis.modal_model import ModeLaw
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
 from sysid.results.judgement import _of_its_modes
 from sysid.structure.amplitude import LawForm
-
-RATE, FALL, RISE, LEVEL = 40.0, 0.06, 0.012, 12.0
-OMEGA, RATIOS = 2 * np.pi * np.array([3.0, 8.0]), np.array([0.012, 0.01])
-PHI = np.array([[0.5, 0.85], [0.85, -0.5]])  # two equal masses of 1 kg
-GAMMA = PHI.T @ np.ones(2)
-STEPS = 12  # of a sample
-
-
-def further(y, times, by):
-    """Numbers a step on, of so many times their slopes."""
-    return [one + times * other for one, other in zip(y, by, strict=True)]
-
-
-def moved(base, *, law=True, both=False, by_first=False):
-    """Absolute accelerations by a Runge-Kutta method of fourth order, the base band-limited.
-
-    With `both` the second mode falls too, by the first power of its level; `by_first` as the first one does.
-    """
-    n = base.size * STEPS
-    fine = scipy.signal.resample(base, 2 * n).tolist()
-    h, sizes = 1 / (RATE * STEPS), np.abs(PHI).max(axis=0).tolist()
-    at_rest, damped_at_rest, gamma = OMEGA.tolist(), RATIOS.tolist(), GAMMA.tolist()
-
-    def slopes_of(k, q, v, u, level=None):
-        """Slopes of one mode, (q', v'), and the level by which it moves: its own, where none is given."""
-        w, zeta, power = at_rest[k], damped_at_rest[k], 0.5 if k == 0 or by_first else 1.0
-        if law and (k == 0 or both or by_first):
-            for _ in range(1 if level is not None else 8):
-                own = sizes[k] * w * math.hypot(w * q, v) / LEVEL if level is None else level
-                w = at_rest[k] * (1 - FALL * own**power)
-            level, zeta = own, zeta + RISE * own
-        return v, -2 * zeta * w * v - w * w * q - gamma[k] * u, level
-
-    def slope(y, u):
-        *first, level = slopes_of(0, y[0], y[1], u)
-        return *first, *slopes_of(1, y[2], y[3], u, level if by_first else None)[:2]
-
-    y, out = [0.0] * 4, []  # (q, v) of each mode
-    for k in range(n - 1):
-        u, middle, then = fine[2 * k : 2 * k + 3]
-        a = slope(y, u)
-        if k % STEPS == 0:
-            out.append([a[1], a[3], u])
-        b = slope(further(y, h / 2, a), middle)
-        c = slope(further(y, h / 2, b), middle)
-        d = slope(further(y, h, c), then)
-        y = [one + h / 6 * (p + 2 * (q + r) + s) for one, p, q, r, s in zip(y, a, b, c, d, strict=True)]
-    motions = np.array(out).T
-    return PHI @ motions[:2] + motions[2]
-
-
-def rubbing(base, size=0.06, smooth=0.003):
-    """Absolute accelerations of the same, linear but for friction in both storeys, N, as `moved` has them."""
-    n, h = base.size * STEPS, 1 / (RATE * STEPS)
-    fine, drifts = scipy.signal.resample(base, 2 * n), np.array([PHI[0], PHI[1] - PHI[0]]).tolist()
-    (a, b), (c, d) = drifts
-    loss, rise, load = (2 * RATIOS * OMEGA).tolist(), (OMEGA**2).tolist(), np.outer(fine, GAMMA).tolist()
-
-    def slope(q, r, v, w, u):
-        first, second = size * math.tanh((a * v + b * w) / smooth), size * math.tanh((c * v + d * w) / smooth)
-        of_first = -loss[0] * v - rise[0] * q - a * first - c * second - u[0]
-        return v, w, of_first, -loss[1] * w - rise[1] * r - b * first - d * second - u[1]
-
-    y, out = [0.0] * 4, []
-    for k in range(n - 1):
-        one = slope(*y, load[2 * k])
-        if k % STEPS == 0:
-            out.append(one[2:])
-        two = slope(*further(y, h / 2, one), load[2 * k + 1])
-        three = slope(*further(y, h / 2, two), load[2 * k + 1])
-        four = slope(*further(y, h, three), load[2 * k + 2])
-        y = [at + h / 6 * (p + 2 * (q + r) + s) for at, p, q, r, s in zip(y, one, two, three, four, strict=True)]
-    return PHI @ np.transpose(out) + base
-
-
-def shaken(level, seed, samples=1200):
-    rng = np.random.default_rng(seed)
-    spectrum = np.fft.rfft(rng.standard_normal(samples))
-    freq = np.fft.rfftfreq(samples, 1 / RATE)
-    spectrum[(freq < 0.8) | (freq > 11.0)] = 0
-    base = np.fft.irfft(spectrum, samples)
-    t = np.arange(samples) / RATE
-    return level * base / base.std() * np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
-
-
-def test_of(levels, *, noise=0.005, seed=0, samples=1200, by=moved, **how):
-    rng, runs = np.random.default_rng([seed, 1]), []  # not the numbers of which the base is made
-    for number, level in enumerate(levels):
-        base = shaken(level, 10 * seed + number, samples)
-        response = by(base, **how)
-        noisy = response + noise * response.std(axis=1, keepdims=True) * rng.standard_normal(response.shape)
-        runs.append((base[None] + noise * base.std() * rng.standard_normal(base.size), noisy, None))
-    sensors = [sysid.Sensor(f"floor {i}", (0, 0, float(i)), "x") for i in (1, 2)]
-    return sysid.Measurement.from_time(runs, RATE, rigid_body=np.ones((2, 1)), band=(0.8, 12.0), sensors=sensors)
-
-
-test_of.__test__ = False
+from tests.modal_analysis.softening_frame import (
+    FALL,
+    LEVEL,
+    OMEGA,
+    PHI,
+    RATE,
+    RATIOS,
+    RISE,
+    moved,
+    recorded,
+    rubbing,
+    shaken,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def test():
-    return test_of((0.3, 3.0))
+    return recorded((0.3, 3.0))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +104,7 @@ def test_the_law_is_found_within_its_deviations(answer):
 
 def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
     """Beside what the second mode's changes leave, a law of the first alone is not beyond chance."""
-    problem = sysid.Problem(test_of((0.3, 3.0), both=True, samples=900), amplitude=sysid.AmplitudeLaw())
+    problem = sysid.Problem(recorded((0.3, 3.0), both=True, samples=900), amplitude=sysid.AmplitudeLaw())
     answer = sysid.identify(problem, rng=0)
     first, second = answer.structure.laws
     assert (first.form[:2], second.form[:2]) == ((0.5, 1.0), (1.0, 1.0))
@@ -197,7 +114,11 @@ def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
         found = np.concatenate([np.log([law.frequency, law.ratio]), law.values])
         assert np.all(np.abs(found - truth) < 5 * np.sqrt(np.diag(law.covariance)))
     assert [one.numbers["mode"] for one in answer.findings if one.kind == "amplitude law"] == [1.0, 2.0]
-    assert [one["mode"] for one in answer.to_dict()["amplitude_laws"]] == [1, 2]
+    for told, law in zip(answer.to_dict()["amplitude_laws"], answer.structure.laws, strict=True):
+        unit = 5.0 / told["reference_level_m_s2"]
+        w = told["frequency_at_rest_hz"] * (1 - told["fall_of_frequency"] * unit ** told["exponent_of_frequency"])
+        zeta = told["damping_ratio_at_rest"] + told["rise_of_damping"] * unit ** told["exponent_of_damping"]
+        assert (w, zeta) == pytest.approx(law.at(5.0), rel=1e-9) and told["mode"] == law.mode + 1
     again = sysid.load(answer.save(tmp_path / "result.h5"))
     assert [law.at(2.0) for law in again.structure.laws] == [law.at(2.0) for law in answer.structure.laws]
     assert again.problem.amplitude == sysid.AmplitudeLaw()
@@ -205,7 +126,7 @@ def test_each_mode_has_a_law_and_exponents_of_its_own(tmp_path):
 
 def test_a_mode_that_follows_the_level_of_the_first_is_found_and_predicted(tmp_path):
     asked = sysid.AmplitudeLaw(modes=[1, 2], exponents=(0.5, 1.0))
-    answer = sysid.identify(sysid.Problem(test_of((0.3, 3.0), by_first=True, samples=900), amplitude=asked), rng=0)
+    answer = sysid.identify(sysid.Problem(recorded((0.3, 3.0), by_first=True, samples=900), amplitude=asked), rng=0)
     first, second = answer.structure.laws
     assert (first.followed, second.followed) == (0.0, pytest.approx(3.0, rel=1e-3))
     assert (first.level_of, second.level_of) == (0, 0)
@@ -233,10 +154,12 @@ def test_modes_that_are_one_count_once(test):
         _modes_of(fit, sysid.AmplitudeLaw(modes=[1, 3]))
 
 
-def test_a_mode_that_shows_at_several_levels_has_one_law(test):
-    """As the linear fit of a long test of levels 1:10 has three poles of one mode."""
-    fit = record_modes(test, OMEGA[[0, 0, 0, 1]] * [0.93, 0.96, 1.0, 1.0], RATIOS[[0, 0, 0, 1]])
-    assert fit.model.m == 4
+@pytest.mark.parametrize("beside", [[], [0.999]])
+def test_a_mode_that_shows_at_several_levels_has_one_law(test, beside):
+    """As the linear fit of a long test of levels 1:10 has three poles of one mode, and one that shows no peak."""
+    omega = np.append(OMEGA[[0, 0, 0, 1]] * [0.93, 0.96, 1.0, 1.0], 0.9 * OMEGA[1] * np.ones(len(beside)))
+    fit = record_modes(test, omega, np.append(RATIOS[[0, 0, 0, 1]], beside))
+    assert fit.model.m == 4 + len(beside)
     found = with_laws(fit, sysid.AmplitudeLaw(modes=[1], exponents=(0.5, 1.0)), monitor=FitMonitor())
     (law,) = fitted_laws(found)
     assert found.model.m == 2  # and so two sensors have as many modes as there are
@@ -249,7 +172,7 @@ def test_a_mode_that_shows_at_several_levels_has_one_law(test):
 
 def test_where_all_modes_left_have_a_law_none_is_looked_for(monkeypatch):
     """As where a mode of its own in the linear fit becomes one with its neighbour."""
-    test = test_of((0.3, 3.0), both=True, samples=900)
+    test = recorded((0.3, 3.0), both=True, samples=900)
     fit = record_modes(test, OMEGA[[0, 0, 1]] * [0.95, 1.0, 1.0], RATIOS[[0, 0, 1]])
     monkeypatch.setattr("sysid.modal_analysis.amplitude_fit._modes_of", lambda fit, stated: [0, 1, 2])
     found = with_laws(fit, sysid.AmplitudeLaw(exponents=(0.5, 1.0)), monitor=FitMonitor())
@@ -268,6 +191,19 @@ def test_two_near_modes_of_one_shape_that_are_two_stay_two(test):
     assert [law.frequency for law in fitted_laws(found)] == pytest.approx([3.0], rel=1e-3)
 
 
+@pytest.mark.parametrize(("share", "hertz", "stay"), [(0.0, 3.1, 2), (0.1, 3.3, 3)])
+def test_a_second_mode_of_a_shape_stays_beside_a_law_only_where_the_records_ask_for_it(test, share, hertz, stay):
+    """By squares, which take the base as exact: its noise near the peak asks for a mode that is none."""
+    whole, w, beside = replace(test.whole, plain=True), 2 * np.pi * test.freq, 2 * np.pi * hertz
+    added = share * w**2 / (beside**2 - w**2 + 0.04j * beside * w) * test.base
+    both = replace(test, response=test.response + PHI[:, :1] * added, whole=whole)
+    fit = record_modes(both, np.append(OMEGA, beside), np.append(RATIOS, 0.02))
+    first = int(np.argmin(np.abs(fit.parameters.modes.omega - OMEGA[0])))
+    law = _started(fit, first, (0.5, 1.0), (0.03,), ROUGH, FitMonitor())
+    assert law.model.m == 3
+    assert _without_doubles(law, ROUGH, FitMonitor()).model.m == stay
+
+
 def test_a_law_is_judged_against_the_fit_without_it_alone(plain):
     """The first mode has a law, which gains enough for two; a law of the second, linear one is left out beside it."""
     monitor, linear = FitMonitor(), plain.prepared.modal[0].record_fit
@@ -281,7 +217,7 @@ def test_a_law_is_judged_against_the_fit_without_it_alone(plain):
 
 
 def test_a_law_gains_nothing_by_steps_that_the_fit_without_it_has_not_taken():
-    first = record_modes(test_of((0.3, 3.0), law=False, samples=600), OMEGA, RATIOS)
+    first = record_modes(recorded((0.3, 3.0), law=False, samples=600), OMEGA, RATIOS)
     monitor, linear = FitMonitor(), refitted(first, first.parameters)
     p = linear.parameters
     off = replace(p, modes=p.modes._replace(omega=1.03 * p.modes.omega))
@@ -294,7 +230,7 @@ def test_a_law_gains_nothing_by_steps_that_the_fit_without_it_has_not_taken():
 
 
 def test_noise_of_the_base_does_not_stand_for_what_laws_of_friction_miss():
-    fit = record_modes(test_of((0.3, 1.0, 3.0), seed=3, samples=600, by=rubbing), OMEGA, 1.3 * RATIOS)
+    fit = record_modes(recorded((0.3, 1.0, 3.0), seed=3, samples=600, by=rubbing), OMEGA, 1.3 * RATIOS)
     linear = refitted(fit, fit.parameters, monitor=FitMonitor())
     assert 0.03 < left_of(linear) < 0.1
     found = with_laws(linear, sysid.AmplitudeLaw(exponents=(0.5, -1.0)), monitor=FitMonitor())
@@ -306,7 +242,7 @@ def test_noise_of_the_base_does_not_stand_for_what_laws_of_friction_miss():
 
 def test_a_mode_above_the_lines_at_rest_that_moves_within_them_keeps_its_law():
     """The second mode is at 8 Hz at rest, and 7 % lower at the levels of the test; lines end between."""
-    test = test_of((0.3, 3.0), both=True, samples=900).in_band(0.8, 7.93)
+    test = recorded((0.3, 3.0), both=True, samples=900).in_band(0.8, 7.93)
     answer = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(1.0, 1.0))), rng=0)
     assert answer.structure.natural_frequencies[1] > test.freq[-1]
     assert [law.mode for law in answer.structure.laws] == [0, 1]
@@ -319,7 +255,7 @@ def test_of_modes_with_laws_those_that_are_stated_are_the_structure_s():
     """Both modes follow their amplitude, and one frequency is stated: the other mode's law takes none with it."""
     stated = sysid.SpectralStiffness([2.9])
     asked = sysid.AmplitudeLaw(exponents=(1.0, 1.0))
-    test = test_of((0.3, 3.0), both=True, samples=900)
+    test = recorded((0.3, 3.0), both=True, samples=900)
     answer = sysid.identify(sysid.Problem(test, stiffness=stated, amplitude=asked), rng=0)
     assert answer.structure.natural_frequencies == pytest.approx([3.0], rel=0.03)  # true; the exponent asked is not
     assert [law.mode for law in answer.structure.laws] == [0]
@@ -367,6 +303,18 @@ def test_a_stored_answer_keeps_its_law(answer, tmp_path):
     assert [law.likelier for law in again.prepared.modal[0].laws] == [True, False]  # one was left out
     assert again.prepared.modal[0].omega == pytest.approx(answer.prepared.modal[0].omega, rel=1e-12)
     assert again.residual == pytest.approx(answer.residual, rel=1e-9)
+
+
+def test_draws_tell_how_a_law_scatters(answer):
+    """Of two, one as the answer, one without a law."""
+    score, name = scored(answer), "mode 1: change of frequency with amplitude"
+    (value, _), (std, _) = answer.structure.laws[0].change()
+    assert (score.values[name], score.stds[name]) == (value, std)
+    linear = replace(score, values={key: one for key, one in score.values.items() if "amplitude" not in key})
+    ends = [JobResult(i, 0, True, "", np.zeros(0), 0.01, one) for i, one in enumerate((score, linear))]
+    (found,) = (one for one in spreads(answer, ends) if one.name == name)
+    assert (found.std, found.inside) == (std, 0.5)
+    assert found.drawn == pytest.approx(abs(value) / np.sqrt(2))
 
 
 def test_an_export_at_a_level_holds_the_matrices_there_and_names_it(answer, tmp_path, capsys):
@@ -440,7 +388,7 @@ def test_a_law_that_explains_the_records_is_found_before_the_linear_fit_ends(mon
     def whole(*_, **__):
         raise AssertionError("the whole linear fit")
 
-    test = test_of((0.3, 3.0))
+    test = recorded((0.3, 3.0))
     w, weak = 2 * np.pi * test.freq, 2 * np.pi * 5.5
     added = 0.005 * w**2 / (weak**2 - w**2 + 0.02j * weak * w) * test.base
     monkeypatch.setattr("sysid.modal_analysis.fit.whole_fit", whole)
@@ -448,11 +396,11 @@ def test_a_law_that_explains_the_records_is_found_before_the_linear_fit_ends(mon
     assert fit.omega / (2 * np.pi) == pytest.approx([3.0, 5.5, 8.0], rel=3e-3)
     assert [law.frequency for law in fit.laws if law.is_certain] == pytest.approx([3.0], rel=1e-3)
     with pytest.raises(AssertionError, match="whole linear fit"):
-        fit_modes(test_of((0.3, 3.0), law=False), amplitude=asked)
+        fit_modes(recorded((0.3, 3.0), law=False), amplitude=asked)
 
 
 def test_a_linear_structure_is_told_to_be_one():
-    test = test_of((0.3, 3.0), law=False)
+    test = recorded((0.3, 3.0), law=False)
     law = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 0.5))), rng=0)
     plain = sysid.identify(sysid.Problem(test), rng=0)
     assert law.structure.laws == ()
@@ -461,14 +409,14 @@ def test_a_linear_structure_is_told_to_be_one():
 
 
 def test_one_short_run_of_one_level_leaves_the_law_open():
-    test = test_of((0.5,), noise=0.3, samples=400)
+    test = recorded((0.5,), noise=0.3, samples=400)
     result = sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(exponents=(0.5, 0.5))), rng=0)
     assert result.structure.laws == ()
     assert any(one.kind == "amplitude open" for one in result.findings)
 
 
 def test_a_mode_that_the_records_do_not_show_is_refused():
-    test = test_of((0.3,), law=False, samples=400)
+    test = recorded((0.3,), law=False, samples=400)
     with pytest.raises(sysid.InputError, match="mode 5"):
         sysid.identify(sysid.Problem(test, amplitude=sysid.AmplitudeLaw(modes=[5])), rng=0)
 
@@ -492,7 +440,7 @@ def test_a_law_by_the_level_of_a_mode_that_the_estimate_has_not_is_left_out(test
 def test_a_law_of_a_mode_that_the_answer_has_not_is_told_and_left_out():
     """One mode is asked for, and the law is of the other."""
     law = sysid.AmplitudeLaw(modes=[2], exponents=(1.0, 1.0))
-    test = test_of((0.3, 3.0), both=True)
+    test = recorded((0.3, 3.0), both=True)
     result = sysid.identify(sysid.Problem(test, amplitude=law), strategy=sysid.Modal(modes=1), rng=0)
     assert result.structure.n == 1
     assert not result.structure.laws
