@@ -337,7 +337,7 @@ COMMANDS = {
     "it where there is one",
     "run idle.py --resume out --fresh": "--resume excludes --fresh and --out",
     "run shear_building --goal 0.1": "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for "
-    "a test that 'sysid read' wrote",
+    "a test that 'sysid read' wrote; what a module's problem() takes is said by --set KEY=VALUE",
     "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
 }
 
@@ -560,9 +560,7 @@ def test_a_comparison_says_what_its_columns_are():
             "relative residual",
             "; M, K, C: error against the reference, which has no damping, so that C has no relative error",
         ),
-        before.format(
-            "objective (all that is fitted, weighed by its stated noise)", "; M, K, C: error against the reference"
-        ),
+        before.format("objective (all that is fitted, weighed by its noise)", "; M, K, C: error against the reference"),
     ]
 
 

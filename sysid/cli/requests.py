@@ -115,7 +115,8 @@ def _test_recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     extra = _of_tests(options)
     if not is_test(given.module):
         words = "--mass, --lumped, --band, --gain-std, --at-rest, --amplitude and --goal are for a test that"
-        refuse((extra, f"{words} 'sysid read' wrote"))
+        instead = "what a module's problem() takes is said by --set KEY=VALUE"
+        refuse((extra, f"{words} 'sysid read' wrote; {instead}"))
         return given
     twice = [name for name in extra if name in given.parameters]
     refuse(

@@ -51,9 +51,10 @@ class Comparison:
 
     @property
     def quantity(self) -> str:
-        """Quantity that is minimised: "residual" where the relative residual is all of it, else "objective"."""
+        """What is minimised: "residual" where the relative residual is all of it, else "objective"."""
         test = self.problem.measurement
-        alone = test.response_std is None and test.force is None and len(self.problem.formulation.terms) == 1
+        noise = test.is_whole or test.response_std is not None
+        alone = not noise and test.force is None and len(self.problem.formulation.terms) == 1
         return "residual" if alone else "objective"
 
     @property
@@ -227,7 +228,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
     """Meaning of the columns, and the words of the methods that are no fit."""
     what = {
         "residual": "relative residual",
-        "objective": "objective (all that is fitted, weighed by its stated noise)",
+        "objective": "objective (all that is fitted, weighed by its noise)",
     }[comparison.quantity]
     truth, errors = comparison.problem.reference, ""
     if truth is not None:

@@ -12,7 +12,7 @@ from sysid.errors import InputError
 from sysid.jobs.job import JobResult
 from sysid.problem.prepared import Prepared
 from sysid.results.identification import Identification
-from sysid.results.tables import labelled, quantities
+from sysid.results.tables import changes_by_laws, linear_deviations, quantities
 from sysid.search.continuation import apart
 from sysid.search.other_answers import entries_apart
 from sysid.structure.structure import Structure
@@ -106,7 +106,7 @@ class Spread:
 
 
 def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
-    """Frequencies, damping ratios and unknowns of a result in the draws that succeeded.
+    """Frequencies, damping ratios, unknowns and laws of amplitude of a result in the draws that succeeded.
 
     Raises
     ------
@@ -117,10 +117,10 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     if len(found) < 2:
         raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
     u = result.uncertainty
-    stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
+    stds = linear_deviations(result, u)
     draws = [_quantities(result, end) for end in found]
     rows = []
-    for name, value in quantities(result).items():
+    for name, value in ((name, value) for name, value in quantities(result).items() if name in draws[0]):
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
         rows.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
@@ -128,7 +128,7 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
 
 
 def _quantities(result: Identification, end: JobResult) -> dict[str, float]:
-    """`quantities` of an end of the problem of a result."""
+    """`quantities` of an end of the problem of a result; of laws only where the whole was identified anew."""
     if end.score is not None:
-        return end.score.values
+        return dict.fromkeys(changes_by_laws(result.structure), 0.0) | end.score.values  # modes may have none there
     return quantities(replace(result, x=end.x, structure=result.problem.structure(end.x)))

@@ -15,7 +15,7 @@ from sysid.modal_analysis import outliers
 from sysid.modal_analysis.pole_functions import unit_columns
 from sysid.modal_analysis.response import misfits, states_noise
 from sysid.results.identification import Identification
-from sysid.results.tables import FREQUENCY, RATIO, label, labelled, quantities
+from sysid.results.tables import FREQUENCY, RATIO, label, linear_deviations, quantities
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT
 
@@ -150,7 +150,7 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
     u = None if exact else result.quick_uncertainty
     stds, noise = dict[str, float](), np.nan
     if u is not None:
-        stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
+        stds = linear_deviations(result, u)
         noise = u.inflation**2 * _noise(result)
     return Score(
         determined=result.determined,

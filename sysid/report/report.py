@@ -192,6 +192,7 @@ def _modes(it: Identification) -> str:
         it.structure.residual.count > 0
     )
     notes.append("Effective mass in % of the rigid-body mass of its base direction.")
+    notes += ["Modes that follow an amplitude are given at rest."] * bool(structure.laws)
     if u is not None:
         columns.insert(2, ["±", *(width for _, width in rounded_frequencies), ""])
         columns.append(["±", *(width for _, width in damping), ""])

@@ -227,6 +227,7 @@ def _mode_table(it: Answer) -> list[str]:
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
     notes += ["~ one of many values that fit as well"] * bool(many.any())
+    notes += ["modes that follow an amplitude: at rest"] * bool(s.laws)
     return [*lines, "; ".join(notes), *tables.missing_mass(it), *tables.residual_modes(it)]
 
 

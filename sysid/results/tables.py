@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.checks.model_error import LEVEL
 from sysid.assessment.checks.stated import sides_of
+from sysid.assessment.uncertainty import Uncertainty
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.delays import Delays
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.response import misfits, of_residual_modes, records_of, residual_share
 from sysid.results.answer import Answer
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import EXACT, LIKELY, ROUND_OFF
 
 FREQUENCY, RATIO = "frequency, Hz", "damping ratio"
@@ -342,7 +343,27 @@ def quantities(result: Answer) -> dict[str, float]:
     """
     s, values = result.structure, result.values
     free = [v.name for v in result.facts.unknowns if not (v.fixed or v.is_ratio) and v.name in values]
-    return labelled(s.natural_frequencies, result.identified_ratios, {name: values[name] for name in free})
+    changes = {name: value for name, (value, _) in changes_by_laws(s).items()}
+    return labelled(s.natural_frequencies, result.identified_ratios, {name: values[name] for name in free}) | changes
+
+
+def linear_deviations(result: Answer, u: Uncertainty) -> dict[str, float]:
+    """Standard deviations of `quantities`, by label."""
+    of_laws = {name: std for name, (_, std) in changes_by_laws(result.structure).items()}
+    return labelled(u.natural_frequencies, u.damping_ratios, u.variables) | of_laws
+
+
+def changes_by_laws(structure: Structure) -> dict[str, tuple[float, float]]:
+    """Relative change of frequency, and change of damping ratio, of modes over the levels of their laws, by label.
+
+    Each with its standard deviation.
+    """
+    names = "change of frequency with amplitude", "change of damping ratio with amplitude"
+    return {
+        label(law.mode, name): (value, std)
+        for law in structure.laws
+        for name, value, std in zip(names, *law.change(), strict=True)
+    }
 
 
 def labelled(frequencies: Array, ratios: Array, unknowns: dict[str, Array]) -> dict[str, float]:

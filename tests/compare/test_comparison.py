@@ -90,6 +90,9 @@ def test_a_comparison_without_results_is_a_head_without_rows(compared):
 
 def test_what_is_compared_is_the_residual_where_nothing_else_is_minimised(alone):
     assert Comparison(two_masses(), 0, None, ()).quantity == "residual"
+    white = np.random.default_rng(0).standard_normal((3, 400))
+    records = sysid.Measurement.from_time([(white[:1], white[1:], None)], 50.0, rigid_body=np.ones((2, 1)))
+    assert Comparison(sysid.Problem(records), 0, None, ()).quantity == "objective"  # by the noise that is found
     compared = compare(two_masses(noise=0.01), listener=after_the_first)
     assert compared.quantity == "objective"
     assert " residual  " in comparison_text(compared)
