@@ -116,11 +116,13 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     found = [end for end in ends if end.success]
     if len(found) < 2:
         raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
-    u = result.uncertainty
-    stds = linear_deviations(result, u)
-    draws = [_quantities(result, end) for end in found]
+    stds = linear_deviations(result, result.uncertainty)
+    unchanged = dict.fromkeys(changes_by_laws(result.structure), 0.0)  # of a draw whose modes have no law
+    draws = [_quantities(result, end) if end.score is None else unchanged | end.score.values for end in found]
     rows = []
-    for name, value in ((name, value) for name, value in quantities(result).items() if name in draws[0]):
+    for name, value in quantities(result).items():
+        if name not in draws[0]:  # a law, where draws fit the unknowns alone
+            continue
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
         rows.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
@@ -128,7 +130,5 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
 
 
 def _quantities(result: Identification, end: JobResult) -> dict[str, float]:
-    """`quantities` of an end of the problem of a result; of laws only where the whole was identified anew."""
-    if end.score is not None:
-        return dict.fromkeys(changes_by_laws(result.structure), 0.0) | end.score.values  # modes may have none there
+    """`quantities` of an end of the problem of a result, by its unknowns."""
     return quantities(replace(result, x=end.x, structure=result.problem.structure(end.x)))

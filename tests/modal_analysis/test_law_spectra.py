@@ -43,7 +43,7 @@ from tests.modal_analysis.softening_frame import (
     recorded,
     rubbing,
     shaken,
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
