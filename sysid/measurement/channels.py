@@ -67,9 +67,13 @@ def without_gains(test: Measurement, errors: Array) -> Measurement:
     )  # fmt: skip
 
 
-def without_constants(test: Measurement, errors: Array) -> Measurement:
-    """The test without the share of the base's motion that errors of its sensors' gains, (n_sensors,), add to it."""
-    return replace(test, response=test.response - errors[:, None] * (test.rigid_body @ test.base))
+def without_constants(test: Measurement, constants: Array) -> Measurement:
+    """The test without shares of the base's motion, (n_sensors, d), that a wrong gain, sign or axis adds to sensors.
+
+    `constants` of its `WholeRecords` says so.
+    """
+    whole = test.whole and test.whole.less(constants)
+    return replace(test, response=test.response - constants @ test.base, whole=whole)
 
 
 def without_delays(test: Measurement, delays: Array) -> Measurement:

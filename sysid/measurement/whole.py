@@ -86,8 +86,9 @@ class WholeRecords:
     and end `at_rest` have no such numbers. Lines are multiples of ``sample_rate / N``, Hz. `noise` is stated, or None
     where it is estimated with the fit. `varying`, (runs, channels), are sensors, forces and base directions whose level
     is found to vary over the lines; `taken`, (n_sensors [+ 1],), s, are delays that were taken off sensors and force:
-    at one of its ends such a record holds what is not its own. `plain` tells that squares are fitted, the base's motion
-    as recorded, and `grows` that the noise of each channel holds a share of its signal. All four are set by the fit, in
+    at one of its ends such a record holds what is not its own. `constants`, (n_sensors, d), are shares of the base's
+    motion that were taken off the sensors. `plain` tells that squares are fitted, the base's motion
+    as recorded, and `grows` that the noise of each channel holds a share of its signal. All five are set by the fit, in
     no file. `tones` are frequencies of steady sines, Hz, of which each channel and run holds one.
     """
 
@@ -97,6 +98,7 @@ class WholeRecords:
     noise: NoiseLevels | None = field(default=None)
     varying: NDArray[np.bool_] | None = field(default=None)
     taken: Array | None = field(default=None)
+    constants: Array | None = field(default=None)
     plain: bool = field(default=False)
     grows: bool = field(default=False)
     tones: tuple[float, ...] = field(default=())
@@ -135,12 +137,18 @@ class WholeRecords:
         if taken is not None:
             taken = np.concatenate([taken[: kept.size][kept], taken[kept.size :]])
         noise = self.noise and replace(self.noise, response=self.noise.response[..., kept])
-        return replace(self, noise=noise, taken=taken)
+        constants = None if self.constants is None else self.constants[kept]
+        return replace(self, noise=noise, taken=taken, constants=constants)
 
     def earlier(self, delays: Array) -> WholeRecords:
         """That of records whose delays, s, (n_sensors [+ 1],), were taken off their spectra."""
         taken = delays if self.taken is None else self.taken + delays
         return replace(self, taken=taken if np.any(taken) else None)
+
+    def less(self, constants: Array) -> WholeRecords:
+        """That of records of whose sensors shares of the base's motion, (n_sensors, d), were taken off."""
+        total = constants if self.constants is None else self.constants + constants
+        return replace(self, constants=total if np.any(total) else None)
 
     def profile_at(self, lines: NDArray[np.bool_]) -> Array | float:
         """Noise at lines, (n_freq,), over its level: alike at all."""

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import InputError
-from sysid.measurement.channels import without_delays
+from sysid.measurement.channels import without_constants, without_delays
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.misfit import deviations
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.model_order import least_of, pruned
@@ -19,13 +20,17 @@ from sysid.modal_analysis.residual_tests import delays_beside_dampers, left_of_c
 from sysid.modal_analysis.rough_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
+
+_NEAR = Limits(6, 60, creeping=1.0)
 
 
 def first_modes(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[Array, RecordFit | None]:
     """Delays, s, with those that the first modes show, and these modes without them, if any.
 
     Modes that are still missing may look like small ones, which are left to the fit of all modes; late channels look
-    like weak modes beside strong ones, and further modes would stand for what is left of them.
+    like weak modes beside strong ones, and further modes would stand for what is left of them. What sensors of a wrong
+    sign or axis add is taken off: the `constants` of the fit.
     """
     some = without_delays(test.at(decimated_lines(test)), delays)
     try:
@@ -35,7 +40,7 @@ def first_modes(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[
             first = settled_modes(first, monitor)
             late = _newly_late(first, delays, monitor, 25.0)
         if not np.any(late):
-            first = by_the_noise_found(first, monitor)
+            first = by_the_noise_found(_without_wrong_sensors(first, monitor), monitor)
             late = _newly_late(first, delays, monitor, 5.0)
     except (InputError, np.linalg.LinAlgError):  # the fit of all modes says why
         return delays, None
@@ -43,9 +48,62 @@ def first_modes(test: Measurement, delays: Array, monitor: FitMonitor) -> tuple[
         return first_modes(test, delays + late, monitor)
     if not np.any(left := delays_beside_dampers(first) * (delays != 0)):
         return delays, first
-    trial = on_turned(first, without_delays(some, left), monitor=monitor)
+    turned = without_constants(without_delays(some, left), first.constants)
+    trial = on_turned(first, turned, monitor=monitor)
     better = trial.schwarz - first.schwarz >= 25.0 * price_of_delays(left, np.zeros(left.size), first)
     return (delays + left, trial) if better else (delays, first)
+
+
+def _without_wrong_sensors(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
+    """The fit without shares of the base's motion that sensors of a wrong sign or axis add, where that is likelier.
+
+    Modes, static ones and dampers would stand for them, which take long. Of the sensor that what is left beside the
+    modes tells most of, and so on.
+    """
+    while True:
+        worth, added = _motion_beside(fit)
+        sensor, constants = int(np.argmax(worth)), np.zeros(added.shape)
+        if not _is_mistake(fit.test.rigid_body, fit.constants[sensor] + added[sensor], sensor):
+            return fit
+        constants[sensor] = added[sensor]
+        right = replace(fit, test=without_constants(fit.test, constants))
+        trial = refitted(right, fit.parameters, limits=_NEAR, monitor=monitor)
+        if trial.schwarz - fit.schwarz < 25.0 * np.count_nonzero(added[sensor]) * np.log(fit.model.numbers) / 2:
+            return fit
+        fit = trial
+
+
+def _is_mistake(G: Array, added: Array, sensor: int, near: float = 0.1) -> bool:
+    """True where a share of the base's motion, (d,), turns a sensor's about, takes it away, or puts another in place.
+
+    But for `near` of it. A mode below the lines adds any, and a wrong gain less, which are left to the fit of all modes.
+    """
+    size = np.linalg.norm(G, axis=1)
+    stated, moved = G[sensor], G[sensor] + added
+    usual, along = size[sensor] or size.max(), float(stated @ moved)
+    turned = np.linalg.norm(moved + stated) < near * usual
+    across = abs(along) <= near * usual**2 and abs(np.linalg.norm(moved) / usual - 1) < near
+    return bool(turned or across or np.linalg.norm(moved) < near * usual)
+
+
+def _motion_beside(fit: RecordFit) -> tuple[Array, Array]:
+    """Share of the base's motion in each sensor beside what is fitted, by itself, and its chi-squared.
+
+    (n_sensors,) and (n_sensors, d); what modes above the lines make may be among it.
+    """
+    (n, d), at = fit.test.rigid_body.shape, fit.model.size
+    fitted = np.setdiff1d(np.flatnonzero(~fit.model.held), np.r_[fit.model.of_gains])
+    equations = fit.equations.at(np.append(fitted, np.arange(at, at + n * d)))
+    normal, size = unit_diagonal(equations.normal)
+    gradient, at = equations.gradient / size, fitted.size
+    half = half_inverse(normal[:at, :at], ROUND_OFF)
+    across = half.T @ normal[:at, at:]
+    left, free = gradient[at:] - across.T @ (half.T @ gradient[:at]), normal[at:, at:] - across.T @ across
+    own = [slice(i * d, (i + 1) * d) for i in range(n)]
+    halves = [half_inverse(free[one, one], ROUND_OFF) for one in own]
+    along = [half.T @ left[one] for half, one in zip(halves, own, strict=True)]
+    worth = np.array([2 * np.sum(one**2) for one in along])
+    return worth, np.array([half @ one for half, one in zip(halves, along, strict=True)]) / size[at:].reshape(n, d)
 
 
 def _newly_late(fit: RecordFit, delays: Array, monitor: FitMonitor, times: float) -> Array:
@@ -91,8 +149,8 @@ def rough_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
 
 def near_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     """The same, near enough for the noise: where modes are missing two that are one would move along until the end."""
-    fit, near = rough_fit(test, monitor), Limits(6, 60, creeping=1.0)
-    fit = pruned(refitted(fit, fit.parameters, limits=near, monitor=monitor), monitor, limits=near)
+    fit = rough_fit(test, monitor)
+    fit = pruned(refitted(fit, fit.parameters, limits=_NEAR, monitor=monitor), monitor, limits=_NEAR)
     monitor.keep(fit)
     return fit
 

@@ -100,6 +100,7 @@ def whole_fit(test: Measurement, delays: Array | None = None, *, monitor: FitMon
     refuse_sines(best, test)
     if best.model.whole.taken is not None:
         test = without_delays(test, best.model.whole.taken)
+    test = without_constants(test, best.constants)
     # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
     return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
 
@@ -135,19 +136,21 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
     """
     test, n = fit.test, fit.model.n
     below = np.any(fit.parameters.modes.omega < 2 * np.pi * test.freq[0])
-    stays = fit.stopped or fit.model.whole.plain or np.any(tolerance_of(test))
+    stays = fit.stopped or fit.model.whole.plain or np.any(tolerance_of(test)) or np.any(fit.constants)
     try:
         if stays or not (below or np.any(gain_errors_of(fit).certain)):
             return fit
         given = replace(test, gain_std=np.full(n, std), whole=replace(fit.model.whole, varying=None))
-        gain = gain_errors_of(replace(free := _whole_fit(given, monitor), constants=std * free.parameters.gains))
+        free = _whole_fit(given, monitor)
+        gain = replace(left := gain_errors_of(free), error=left.error + std * free.parameters.gains)
         count, apart = np.count_nonzero(gain.certain), gain.error - gain.error[np.argmax(np.abs(gain.certain))]
         several = count == 2 or np.any((gain.certain != 0) & (np.abs(apart) > most_deviations(n) * gain.std))
         worth = free.schwarz + np.sum(free.parameters.gains**2) / 2 - (price := count * np.log(fit.model.numbers) / 2)
         # An axis or a sign makes larger errors; and what free gains do not make likelier, these alone do not either.
         if (below and several) or np.max(np.abs(gain.certain)) > 3 * std or worth <= fit.schwarz:
             return fit
-        right = without_constants(replace(free.test, gain_std=test.gain_std), gain.certain)
+        constants = gain.certain[:, None] * test.rigid_body
+        right = without_constants(replace(free.test, gain_std=test.gain_std), constants)
         p = replace(free.parameters, gains=np.zeros(0))
         more = refitted(replace(free, test=right), p, some=at_some_lines(right), monitor=monitor)
         likelier = more.settled and more.schwarz - price > fit.schwarz
@@ -156,7 +159,7 @@ def _beside_free_gains(fit: RecordFit, monitor: FitMonitor, std: float = 0.05) -
         return replace(fit, stopped=True)
     except (InputError, np.linalg.LinAlgError):  # the fit at hand is one of gains as they are stated
         return fit
-    return replace(more, constants=gain.certain) if likelier else fit
+    return more if likelier else fit
 
 
 def _anew(fit: RecordFit, monitor: FitMonitor) -> list[RecordFit]:
@@ -179,7 +182,12 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
     are looked for anew where a channel is newly late. Those that chance explains are put back, unless that is worse.
     """
     delays, first = first_modes(test, delays, monitor)
-    fit = found = _whole_fit(without_delays(test, delays), monitor, first)
+    constants = np.zeros(test.rigid_body.shape) if first is None else first.constants
+
+    def without(delays: Array) -> Measurement:
+        return without_constants(without_delays(test, delays), constants)
+
+    fit = found = _whole_fit(without(delays), monitor, first)
     try:
         for _ in range(rounds):
             # What shares of the signal hold of a delay hides it: then it shows by what the fit gains without it.
@@ -189,7 +197,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 new = (total != 0) & (delays == 0)
                 if left is None or (times > 1 and not np.any(new)):
                     continue
-                monitor.doing, turned = "delays", without_delays(test, total)
+                monitor.doing, turned = "delays", without(total)
                 beside = fit.static > 0 or not np.any(new)  # what stands for modes above is not looked for anew
                 trial = on_turned(fit, turned, monitor=monitor) if beside else _whole_fit(turned, monitor)
                 trial = _with_all_modes(trial, monitor) if beside and np.any(new) else trial
@@ -200,7 +208,7 @@ def _on_one_clock(test: Measurement, *, delays: Array, monitor: FitMonitor, roun
                 break
         certain = delays_of(fit).beyond_chance
         if not np.array_equal(certain, delays != 0):
-            fewer = on_turned(fit, without_delays(test, kept := np.where(certain, delays, 0.0)), monitor=monitor)
+            fewer = on_turned(fit, without(kept := np.where(certain, delays, 0.0)), monitor=monitor)
             fit = fewer if fewer.schwarz + price_of_delays(delays, kept, fit) > fit.schwarz else fit
         return fit if fit is found else without_weak_modes(fit, monitor)  # which was done there
     except (Stop, KeyboardInterrupt):

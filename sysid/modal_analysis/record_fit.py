@@ -7,7 +7,7 @@ estimated in turn with the fit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -80,8 +80,6 @@ class RecordFit:
         Modes that the estimate has, where fewer were asked for than the records show.
     left_out : tuple of FittedLaw
         Laws of amplitude that were tried and do not hold.
-    constants : (n_sensors,) or (1,)
-        Errors of gains of which `without_constants` took what they add off the test, zero for none.
     """
 
     test: Measurement
@@ -93,7 +91,6 @@ class RecordFit:
     static: int = 0
     kept: NDArray[np.bool_] | None = None
     left_out: tuple[FittedLaw, ...] = ()
-    constants: Array = field(default_factory=lambda: np.zeros(1))
 
     @cached_property
     def model(self) -> RecordModel:
@@ -171,6 +168,12 @@ class RecordFit:
         return mean / lines
 
     @property
+    def constants(self) -> Array:
+        """Shares of the base's motion, (n_sensors, d), that `without_constants` took off the test; zero for none."""
+        taken = self.model.whole.constants
+        return np.zeros(self.test.rigid_body.shape) if taken is None else taken
+
+    @property
     def shares(self) -> Array | None:
         """Shares of the signal in the noise of responses, forces and base, (runs, c + d); None without any."""
         return np.sqrt(np.split(self.levels, 2, axis=1)[1]) if self.model.whole.grows else None
@@ -213,8 +216,10 @@ class RecordFit:
                 refuse((wrong, "the stored fit of lines is of another test, or holds what is no number"))
             test = replace(test, whole=replace(of_lines, profile=profile, taken=taken))
         refuse((test.whole is None, "a fit of whole records stands beside a test that has none"))
-        constants = tree.get("constants", np.zeros(1))
-        sound = constants.shape in ((1,), (test.n_sensors,)) and bool(np.all(np.isfinite(constants)))
+        constants, G = tree.get("constants", np.zeros(1)), test.rigid_body
+        if constants.shape in ((1,), (test.n_sensors,)):  # of before: errors of gains
+            constants = constants[:, None] * G
+        sound = constants.shape == G.shape and bool(np.all(np.isfinite(constants)))
         test = without_constants(test, constants) if sound else test
         coupling, kept, plain = tree.get("coupling"), tree.get("kept"), tree.get("plain", False)  # of before: none
         test = replace(test, whole=replace(test.whole, varying=tree["varying"], plain=plain))  # type: ignore[type-var]
@@ -222,7 +227,7 @@ class RecordFit:
         laws = tuple(ModeLaw(**{**law, "form": LawForm(*law["form"].tolist())}) for law in tree.get("laws") or ())
         p = Parameters(Modes(**tree["modes"]), tree["rigid"], ends, tree["traces"], coupling, gains, laws)
         ended = {name: tree[name] for name in ("levels", "chi2", "settled", "stopped", "static")}
-        fit = cls(test, p, **ended, kept=kept, left_out=laws_from_tree(tree.get("left_out")), constants=constants)
+        fit = cls(test, p, **ended, kept=kept, left_out=laws_from_tree(tree.get("left_out")))
         model, m, c = fit.model, p.modes.omega.size, fit.model.channels
         parts = [*p.modes, p.rigid, p.ends, p.traces, fit.levels, p.gains, *(law.values for law in laws)]
         shapes: list[tuple[int, ...]] = [
@@ -273,7 +278,7 @@ def refitted(
     fit = fit if static is None else replace(fit, static=static)
     coarse = None if some is None else fit.model_of(p, some).weighed_as_all()
     found = fit_model(fit.model_of(p), p, fit.levels, monitor or FitMonitor(), limits, coarse)
-    return replace(found, left_out=fit.left_out, constants=fit.constants)
+    return replace(found, left_out=fit.left_out)
 
 
 def on_turned(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:

@@ -322,9 +322,14 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     half[asked[:at]] = fitted / size[:at, None]
     of_constants = half @ (fitted.T @ normal[:at, at : at + n]) * size[at : at + n]
     return Gains(
-        np.where(better, plain, error) + fit.constants, np.where(better, plain_std, std), fit.freedom,
+        np.where(better, plain, error) + _along(fit.constants, G), np.where(better, plain_std, std), fit.freedom,
         _moves_by_gains(fit, half, of_constants), rigid, chi2,
     )  # fmt: skip
+
+
+def _along(constants: Array, G: Array) -> Array:
+    """Errors of gains that make the same as shares of the base's motion, (n_sensors, d), as far as any do."""
+    return np.sum(constants * G, axis=1) / np.maximum(np.sum(G**2, axis=1), ROUND_OFF)
 
 
 def _missed(fit: RecordFit) -> bool:
@@ -337,7 +342,7 @@ def _with_gains(fit: RecordFit, asked: NDArray[np.intp], step: Array) -> RecordF
     x = np.zeros(fit.model.size)
     x[asked], errors = np.split(step, [asked.size])
     p = fit.model.unpack(fit.model.moved(fit.model.pack(fit.parameters), x))
-    trial = replace(fit, test=without_constants(fit.test, errors), parameters=p)
+    trial = replace(fit, test=without_constants(fit.test, errors[:, None] * fit.test.rigid_body), parameters=p)
     return replace(trial, chi2=trial.model.gradient(p, fit.levels).chi2)
 
 
@@ -406,12 +411,16 @@ def _moves_by_gains(fit: RecordFit, half: Array, of_constants: Array) -> Array:
 
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
-    """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
+    """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each.
+
+    With what was taken off.
+    """
     chosen, (n, d) = _asked_of_gains(fit), fit.test.rigid_body.shape
     equations, at = fit.equations.at(chosen), chosen.size - 3 * n * d
     normal, size = unit_diagonal(equations.normal)
     half, asked = half_inverse(normal, ROUND_OFF), slice(at, at + n * d)
     step = (half @ (half.T @ (equations.gradient / size)))[asked].reshape(n, d)
+    step += fit.constants * size[asked].reshape(n, d)
     inverse_rows = half[asked].reshape(n, d, -1)
     covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)

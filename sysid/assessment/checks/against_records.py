@@ -73,6 +73,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     if not (changing or below_lines(test, structure).size):
         rigid = list(_rigid(modal, records, free))
     gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
+    gains = [one for one in gains if one.channel not in {it.channel for it in rigid}]  # an axis or a sign is no gain
     of_force = force_misfit(formulation, test, structure, modal.calibration)
     found = [*_at_rest(modal), *leaks, *misses, *of_force, *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
