@@ -76,7 +76,7 @@ def _without_wrong_sensors(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
 def _is_mistake(G: Array, added: Array, sensor: int, near: float = 0.1) -> bool:
     """True where a share of the base's motion, (d,), turns a sensor's about, takes it away, or puts another in place.
 
-    But for `near` of it. A mode below the lines adds any, and a wrong gain less, which are left to the fit of all modes.
+    But for `near` of it. What a mode below the lines or a wrong gain adds is left to the fit of all modes.
     """
     size = np.linalg.norm(G, axis=1)
     stated, moved = G[sensor], G[sensor] + added
@@ -99,9 +99,9 @@ def _motion_beside(fit: RecordFit) -> tuple[Array, Array]:
     half = half_inverse(normal[:at, :at], ROUND_OFF)
     across = half.T @ normal[:at, at:]
     left, free = gradient[at:] - across.T @ (half.T @ gradient[:at]), normal[at:, at:] - across.T @ across
-    own = [slice(i * d, (i + 1) * d) for i in range(n)]
-    halves = [half_inverse(free[one, one], ROUND_OFF) for one in own]
-    along = [half.T @ left[one] for half, one in zip(halves, own, strict=True)]
+    of_each = [slice(i * d, (i + 1) * d) for i in range(n)]
+    halves = [half_inverse(free[one, one], ROUND_OFF) for one in of_each]
+    along = [half.T @ left[one] for half, one in zip(halves, of_each, strict=True)]
     worth = np.array([2 * np.sum(one**2) for one in along])
     return worth, np.array([half @ one for half, one in zip(halves, along, strict=True)]) / size[at:].reshape(n, d)
 

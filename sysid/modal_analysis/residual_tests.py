@@ -317,19 +317,15 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     plain_std = np.hypot(plain_std, plain - error)
     better = (plain_std < std) & np.all(fit.parameters.modes.omega <= 2 * np.pi * fit.test.freq[-1])
     rigid, chi2 = _rigid(fit, beyond)
+    taken = np.sum(fit.constants * G, axis=1) / np.maximum(np.sum(G**2, axis=1), ROUND_OFF)
     fitted = half_inverse(normal[:at, :at], ROUND_OFF)
     half = np.zeros((fit.model.size, fitted.shape[1]))
     half[asked[:at]] = fitted / size[:at, None]
     of_constants = half @ (fitted.T @ normal[:at, at : at + n]) * size[at : at + n]
     return Gains(
-        np.where(better, plain, error) + _along(fit.constants, G), np.where(better, plain_std, std), fit.freedom,
+        np.where(better, plain, error) + taken, np.where(better, plain_std, std), fit.freedom,
         _moves_by_gains(fit, half, of_constants), rigid, chi2,
     )  # fmt: skip
-
-
-def _along(constants: Array, G: Array) -> Array:
-    """Errors of gains that make the same as shares of the base's motion, (n_sensors, d), as far as any do."""
-    return np.sum(constants * G, axis=1) / np.maximum(np.sum(G**2, axis=1), ROUND_OFF)
 
 
 def _missed(fit: RecordFit) -> bool:
@@ -364,7 +360,8 @@ def calibration_of(fit: RecordFit, stated: Calibration) -> Calibration:
     step = np.linalg.solve(seen, size[at:] * (gradient[at:] - across.T @ (half.T @ gradient[:at])))
     of_records, found = seen - np.eye(own.size) / 2, fit.parameters.gains + step
     weight, told = 2 / max(fit.reduced, 1.0), np.flatnonzero(stated.tolerance)[: own.size]
-    of_records, pulled, held = weight * of_records, weight * (of_records @ found + found / 2), np.ones(own.size)
+    of_records, pulled = weight * of_records, weight * (of_records @ found + found / 2)
+    held = np.where(np.isin(told, np.flatnonzero(np.any(fit.constants, axis=1))), 0.0, 1.0)
     while True:  # an error is off by its mean over the root of what records take away of its variance, one before them
         covariance = np.linalg.inv(of_records + np.diag(held))
         shown = np.where((told < n) & (held == 1), 1 - np.diag(covariance), 0.0)
@@ -411,10 +408,7 @@ def _moves_by_gains(fit: RecordFit, half: Array, of_constants: Array) -> Array:
 
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
-    """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each.
-
-    With what was taken off.
-    """
+    """Share of the base's motion in each sensor beside what G says, with what was taken off, and its chi-squared."""
     chosen, (n, d) = _asked_of_gains(fit), fit.test.rigid_body.shape
     equations, at = fit.equations.at(chosen), chosen.size - 3 * n * d
     normal, size = unit_diagonal(equations.normal)

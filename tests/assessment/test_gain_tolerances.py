@@ -15,6 +15,7 @@ from sysid.jobs.changes import drawn_from
 from sysid.measurement.channels import read_by_gains, seen_at_sensors, without_delays, without_gains
 from sysid.modal_analysis.calibration import Calibration
 from sysid.modal_analysis.delays import find_delays
+from sysid.modal_analysis.first_modes import first_modes
 from sysid.modal_analysis.fit import _beside_free_gains, _without_errors, fit_modes, whole_fit
 from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.model_order import Peak, with_peak
@@ -297,7 +298,7 @@ def test_poles_that_stand_for_a_wrong_gain_are_not_in_the_answer(records, plain,
     constants, right = result.modal[0].record_fit.constants, plain["records"]
     driven = np.arange(4) == wrong if wrong < 4 else np.full(4, True)
     size = ERROR if wrong < 4 else 1 / (1 + ERROR) - 1
-    np.testing.assert_allclose(constants[driven], size, atol=0.2 * ERROR)
+    np.testing.assert_allclose(constants[driven], size * records.rigid_body[driven], atol=0.2 * ERROR)
     assert not np.any(constants[~driven])
     ratio = np.mean(result.modal[0].as_recorded.response / right.modal[0].records.response, axis=(0, 2))
     np.testing.assert_allclose(ratio, 1 + ERROR * (np.arange(4) == wrong), atol=0.1 * ERROR)
@@ -314,6 +315,45 @@ def test_poles_that_stand_for_a_wrong_gain_are_not_in_the_answer(records, plain,
     np.testing.assert_array_equal(again.modal[0].records.response, result.modal[0].records.response)
 
 
+def other_axis(test, sensor):
+    """The test where the axis of a sensor is stated across the base's motion, while it is along it."""
+    return dataclasses.replace(test, rigid_body=test.rigid_body * (np.arange(4) != sensor)[:, None])
+
+
+@pytest.mark.parametrize("mistake", ["sign", "axis"])
+def test_what_a_wrong_sign_or_axis_adds_is_no_mode(records, plain, mistake, tmp_path):
+    """It is taken off beside the first modes: the others are as of right records, and the sensor is told."""
+    wrong = misread(records, -2.0 * np.eye(6)[2]) if mistake == "sign" else other_axis(records, 2)
+    first = first_modes(wrong, np.zeros(5), FitMonitor())[1]
+    adds = (-2.0 if mistake == "sign" else 1.0) * np.outer(np.arange(4) == 2, records.rigid_body[2])
+    np.testing.assert_allclose(first.constants, adds, atol=0.05)
+    result, right = sysid.identify(Problem(wrong), rng=0), plain["records"]
+    assert {one.channel for one in result.contradictions} == {"sensor 3"} and not result.structure.residual.count
+    np.testing.assert_array_equal(result.modal[0].record_fit.constants, first.constants)
+    np.testing.assert_allclose(result.structure.natural_frequencies, right.structure.natural_frequencies, rtol=1e-4)
+    np.testing.assert_allclose(
+        np.abs(result.structure.mode_shapes), np.abs(right.structure.mode_shapes), atol=0.01
+    )  # fmt: skip
+    result.save(tmp_path / "result.h5")
+    again = sysid.load(tmp_path / "result.h5")
+    np.testing.assert_array_equal(again.modal[0].record_fit.constants, first.constants)
+    np.testing.assert_array_equal(again.modal[0].records.response, result.modal[0].records.response)
+    assert [str(one) for one in again.contradictions] == [str(one) for one in result.contradictions]
+
+
+def test_two_wrong_sensors_are_taken_off_one_by_one(records):
+    wrong = other_axis(misread(records, -2.0 * np.eye(6)[0]), 3)
+    first = first_modes(wrong, np.zeros(5), FitMonitor())[1]
+    np.testing.assert_allclose(first.constants[:, 0], [-2.0, 0.0, 0.0, 1.0], atol=0.05)
+    assert not np.any(first.constants[1:3])
+
+
+@pytest.mark.parametrize("size", [-0.3, -0.05, 0.05, 0.3])
+def test_wrong_gains_are_left_to_the_fit_of_all_modes(records, size):
+    first = first_modes(misread(records, size * np.eye(6)[1]), np.zeros(5), FitMonitor())[1]
+    assert not np.any(first.constants)
+
+
 def test_right_gains_and_modes_below_the_lines_take_no_constants_off(records):
     """Beside a mode below the lines gains are not judged, and what was taken off would not be told."""
     f = np.sort(frame().natural_frequencies)
@@ -327,7 +367,7 @@ def test_right_gains_and_modes_below_the_lines_take_no_constants_off(records):
 def test_what_ends_the_search_beside_free_gains_or_is_not_likelier_keeps_the_fit_at_hand(records, monkeypatch):
     """Of free gains that are not likelier nothing is fitted again."""
     fit = whole_fit(misread(records, ERROR * np.eye(6)[0]))
-    wrong = dataclasses.replace(fit, test=misread(records, ERROR * np.eye(6)[0]), constants=np.zeros(1))
+    wrong = dataclasses.replace(fit, test=misread(records, ERROR * np.eye(6)[0]))
 
     def ended(error):
         def anew(*_):

@@ -31,6 +31,7 @@ from sysid.modal_analysis.response import columns, modes_above
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
+from sysid.structure.superelement import ResidualModes
 from sysid.structure.thresholds import CANDIDATES, EXACT, FREE, MENDED, NEGLIGIBLE, beyond_chance
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
@@ -69,9 +70,8 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     free = records.fit(*poles, velocity=velocity)
     taken = modal.record_fit is not None and np.any(modal.record_fit.constants)  # what was taken off has to be told
     errors = gain_errors(modal, structure) if taken or not changing else None  # which changes would explain
-    misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
-    if not (changing or below_lines(test, structure).size):
-        rigid = list(_rigid(modal, records, free))
+    misses = list(_misfit(formulation, test, structure, records, free))
+    rigid = [] if changing else list(_rigid(modal, records, free, structure))
     gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
     gains = [one for one in gains if one.channel not in {it.channel for it in rigid}]  # an axis or a sign is no gain
     of_force = force_misfit(formulation, test, structure, modal.calibration)
@@ -126,10 +126,13 @@ def _misfit(
         )  # fmt: skip
 
 
-def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
+def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit, structure: Structure) -> Iterator[Finding]:
     """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
-    test = modal.records
-    if modal.of_records:  # beside the noise of the base, which biases what follows
+    test, fit = modal.records, modal.record_fit
+    if below_lines(test, structure).size:  # which move all in such a proportion, but for what is of one sensor alone
+        moved = fit.constants.copy() if fit is not None else _of_one_sensor(structure.residual, test.freq)
+        chi2 = np.full(test.n_sensors, np.inf)
+    elif modal.of_records:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
     else:
         found = _along_the_base(test, records, free)
@@ -158,6 +161,16 @@ def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator
             "its sign, gain or axis is wrong, or its accelerations are not absolute", channel=test.sensor_names[i],
             numbers={"times": float(moved[i, most[i]]), "direction": most[i] + 1.0, "sensors": float(wrong.size)},
         )  # fmt: skip
+
+
+def _of_one_sensor(modes: ResidualModes, freq: Array, alone: float = 0.99, far: float = 0.1) -> Array:
+    """Share of the base's motion, (n_sensors, d), that modes `far` below the lines stand for, by one sensor `alone`.
+
+    Of at least three, by the squares of their shapes: no structure has such a mode.
+    """
+    squares = modes.shapes**2 / np.maximum(np.sum(modes.shapes**2, axis=0), np.finfo(float).tiny)
+    own = (modes.natural_frequencies < far * freq[freq > 0][0]) & (len(squares) > 2)
+    return np.asarray(-np.where(own & (squares > alone), modes.shapes, 0.0) @ modes.participation)
 
 
 def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tuple[Array, Array] | None:
