@@ -99,11 +99,12 @@ def _motion_beside(fit: RecordFit) -> tuple[Array, Array]:
     half = half_inverse(normal[:at, :at], ROUND_OFF)
     across = half.T @ normal[:at, at:]
     left, free = gradient[at:] - across.T @ (half.T @ gradient[:at]), normal[at:, at:] - across.T @ across
-    of_each = [slice(i * d, (i + 1) * d) for i in range(n)]
-    halves = [half_inverse(free[one, one], ROUND_OFF) for one in of_each]
-    along = [half.T @ left[one] for half, one in zip(halves, of_each, strict=True)]
-    worth = np.array([2 * np.sum(one**2) for one in along])
-    return worth, np.array([half @ one for half, one in zip(halves, along, strict=True)]) / size[at:].reshape(n, d)
+    worth, added = np.zeros(n), np.zeros((n, d))
+    for sensor in range(n):
+        its = slice(sensor * d, (sensor + 1) * d)
+        along = (half := half_inverse(free[its, its], ROUND_OFF)).T @ left[its]
+        worth[sensor], added[sensor] = 2 * along @ along, half @ along
+    return worth, added / size[at:].reshape(n, d)
 
 
 def _newly_late(fit: RecordFit, delays: Array, monitor: FitMonitor, times: float) -> Array:

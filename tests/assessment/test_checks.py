@@ -9,7 +9,7 @@ import pytest
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.checks.against_records import records_of_fit
+from sysid.assessment.checks.against_records import _of_one_sensor, records_of_fit
 from sysid.assessment.checks.context import Context, run
 from sysid.assessment.checks.stated import missed_values, stated_masses
 from sysid.search.strategy import Outcome
@@ -386,3 +386,24 @@ class TestOneListForEveryProblem:
         assert doubts(problem, problem.structure(x), x)
         own = dataclasses.replace(problem, misfit=k - 5000.0)
         assert doubts(own, own.structure(x), x) == []
+
+
+class TestModesBelowTheLines:
+    FREQ = np.linspace(10.0, 100.0, 50)
+
+    def test_those_of_one_sensor_alone_are_its_share_of_the_motion_of_the_base(self):
+        """What they add to its transmissibility, far above them."""
+        f, zeta, shape, load = np.array([0.3]), np.array([0.4]), np.array([0.01, -2.0, 0.02]), np.array([[0.6, -0.3]])
+        share = _of_one_sensor(sysid.ResidualModes(f, zeta, shape[:, None], load), self.FREQ)
+        r = self.FREQ / f
+        adds = -2.0 * load * (r**2 / (1 - r**2 + 2j * zeta * r))[:, None]  # of a single degree of freedom, relative
+        np.testing.assert_allclose(share[1], adds[-1].real, rtol=2e-5)
+        assert not np.any(share[[0, 2]])
+
+    @pytest.mark.parametrize(
+        "shape, f", [([0.3, -2.0, 0.3], 0.3), ([0.0, -2.0, 0.0], 1.1), ([0.0, -2.0], 0.3)],
+        ids=["others move", "not far below", "two sensors"],
+    )  # fmt: skip
+    def test_others_tell_of_no_sensor(self, shape, f):
+        mode = sysid.ResidualModes(np.array([f]), np.array([0.4]), np.array(shape)[:, None], np.ones((1, 2)))
+        assert not np.any(_of_one_sensor(mode, self.FREQ))

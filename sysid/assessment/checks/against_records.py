@@ -169,8 +169,8 @@ def _of_one_sensor(modes: ResidualModes, freq: Array, alone: float = 0.99, far: 
     Of at least three, by the squares of their shapes: no structure has such a mode.
     """
     squares = modes.shapes**2 / np.maximum(np.sum(modes.shapes**2, axis=0), np.finfo(float).tiny)
-    own = (modes.natural_frequencies < far * freq[freq > 0][0]) & (len(squares) > 2)
-    return np.asarray(-np.where(own & (squares > alone), modes.shapes, 0.0) @ modes.participation)
+    below = (modes.natural_frequencies < far * freq[freq > 0][0]) & (len(squares) > 2)
+    return np.asarray(-np.where(below & (squares > alone), modes.shapes, 0.0) @ modes.participation)
 
 
 def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tuple[Array, Array] | None:
