@@ -174,6 +174,12 @@ class RecordFit:
         return np.zeros(self.test.rigid_body.shape) if taken is None else taken
 
     @property
+    def of_axes(self) -> Array:
+        """The constants, (n_sensors, d), of sensors of wrong axis or sign: larger than those of any gain."""
+        add, stated = (np.linalg.norm(one, axis=1) for one in (self.constants, self.test.rigid_body))
+        return np.where((add > stated / 2)[:, None], self.constants, 0.0)
+
+    @property
     def shares(self) -> Array | None:
         """Shares of the signal in the noise of responses, forces and base, (runs, c + d); None without any."""
         return np.sqrt(np.split(self.levels, 2, axis=1)[1]) if self.model.whole.grows else None

@@ -408,13 +408,13 @@ def _moves_by_gains(fit: RecordFit, half: Array, of_constants: Array) -> Array:
 
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
-    """Share of the base's motion in each sensor beside what G says, with what was taken off, and its chi-squared."""
+    """Share of the base's motion in each sensor beside what G says, of wrong axes among it, and its chi-squared."""
     chosen, (n, d) = _asked_of_gains(fit), fit.test.rigid_body.shape
     equations, at = fit.equations.at(chosen), chosen.size - 3 * n * d
     normal, size = unit_diagonal(equations.normal)
     half, asked = half_inverse(normal, ROUND_OFF), slice(at, at + n * d)
     step = (half @ (half.T @ (equations.gradient / size)))[asked].reshape(n, d)
-    step += fit.constants * size[asked].reshape(n, d)
+    step += fit.of_axes * size[asked].reshape(n, d)
     inverse_rows = half[asked].reshape(n, d, -1)
     covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)

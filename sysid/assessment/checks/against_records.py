@@ -73,7 +73,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     misses = list(_misfit(formulation, test, structure, records, free))
     rigid = [] if changing else list(_rigid(modal, records, free, structure))
     gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
-    gains = [one for one in gains if one.channel not in {it.channel for it in rigid}]  # an axis or a sign is no gain
+    gains = [one for one in gains if one.channel not in {it.channel for it in rigid}]  # a sign or an axis is no gain
     of_force = force_misfit(formulation, test, structure, modal.calibration)
     found = [*_at_rest(modal), *leaks, *misses, *of_force, *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
@@ -130,7 +130,7 @@ def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit, structure: 
     """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test, fit = modal.records, modal.record_fit
     if below_lines(test, structure).size:  # which move all in such a proportion, but for what is of one sensor alone
-        moved = fit.constants.copy() if fit is not None else _of_one_sensor(structure.residual, test.freq)
+        moved = fit.of_axes if fit is not None else _of_one_sensor(structure.residual, test.freq)
         chi2 = np.full(test.n_sensors, np.inf)
     elif modal.of_records:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
