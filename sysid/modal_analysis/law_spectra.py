@@ -8,6 +8,7 @@ linear mode and what the law adds, and so is every derivative.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -28,31 +29,33 @@ class LawMotions:
     An addition, (6 + d + k, L), is that to the motion at the lines of a run, and its derivatives by two ends, d
     participations, the logarithms of frequency, damping ratio and size of the shape, and the k numbers of the law; then
     those by all these of the mode whose level counts, where it is another.
-    Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for.
+    Steps in time are so short that a mode has `per_period` in a period, by its frequency when it is first asked for,
+    and that there are `per_line` in one of the highest line.
     """
 
-    def __init__(self, test: Measurement, per_period: float = 16.0) -> None:
-        self.per_period = per_period
+    def __init__(self, test: Measurement, per_period: float = 16.0, per_line: float = 3.0) -> None:
+        self.per_period, self.least = per_period, per_line * test.freq[-1]
         self.rate, self.samples, self.at_rest = _clock_of(test)
         self.lines = [test.freq[lines] for lines in test.own_lines]
         self.base = [base[:, lines] for base, lines in zip(test.base, test.own_lines, strict=True)]
-        self._steps: dict[int, int] = {}
+        self._steps: dict[int, float] = {}
         self._series, self._last = _motions_of(test)
 
     def places(self, run: int) -> NDArray[np.intp]:
         """Numbers of the lines of a run among all of its Fourier transform."""
         return np.round(self.lines[run] * self.samples[run] / self.rate).astype(int)
 
-    def in_time(self, run: int, mode: int, omega: float) -> tuple[int, Array]:
-        """Motion of the base (d, n) whose straight lines from step to step have the run's lines; steps a sample."""
-        times = self._steps.setdefault(mode, int(np.ceil(self.per_period * omega / (2 * np.pi) / self.rate)))
-        if (run, times) not in self._series:
-            fine = self.samples[run] * times
-            spectrum = np.zeros((len(self.base[run]), fine // 2 + 1), complex)
-            straight = np.sinc(self.lines[run] / (self.rate * times)) ** 2
-            spectrum[:, self.places(run)] = self.base[run] / straight * self.rate * times
-            self._series[run, times] = np.fft.irfft(spectrum, fine)
-        return times, self._series[run, times]
+    def in_time(self, run: int, mode: int, omega: float) -> tuple[float, Array]:
+        """Length of a step, s, and motion of the base (d, n) whose straight lines over steps have the run's lines."""
+        rate = self._steps.setdefault(mode, max(self.per_period * omega / (2 * np.pi), self.least))
+        duration = self.samples[run] / self.rate
+        steps = math.ceil(duration * rate)
+        if (run, steps) not in self._series:
+            spectrum = np.zeros((len(self.base[run]), steps // 2 + 1), complex)
+            straight = np.sinc(self.lines[run] * duration / steps) ** 2
+            spectrum[:, self.places(run)] = self.base[run] / straight * steps / duration
+            self._series[run, steps] = np.fft.irfft(spectrum, steps)
+        return duration / steps, self._series[run, steps]
 
     def added(self, p: Parameters, run: Run, law: ModeLaw, *, slopes: bool) -> ComplexArray:
         """What a law adds at the lines of a part of a run, with derivatives or without."""
@@ -61,44 +64,47 @@ class LawMotions:
     def of_run(self, p: Parameters, run: int, law: ModeLaw, *, slopes: bool = False) -> ComplexArray:
         """What a law adds at all lines of a run, with derivatives or, (1, L), without."""
         modes, k, d, rest = p.modes, law.mode, p.modes.gamma.shape[1], self.at_rest[run]
-        spectra = np.fft.rfft(self._moved(p, run, law, slopes)[0])[:, self.places(run)] / self.rate
-        w, base, ends = 2 * np.pi * self.lines[run], self.base[run], self._ends(p, run, k)
+        step, rows, _ = self._moved(p, run, law, slopes)
+        spectra = np.fft.rfft(rows)[:, self.places(run)] * step
+        freq, base, ends = self.lines[run], self.base[run], self._ends(p, run, k)
         pole = np.array([[modes.omega[k]], [modes.ratios[k]]]) * law.equivalent[run][:, None]
-        g, (by_omega, by_ratio) = gains_and_slopes(self.lines[run], *pole)
+        g, by_pole = gains_and_slopes(freq, *pole)
+        moved, moved_by_pole = _in_steps(freq, pole, step)
+        w, load = 2 * np.pi * freq, modes.gamma[k] @ base
         transients = np.zeros((2, w.size)) if rest else np.stack([1 / w**2, 1j / w])
-        load = modes.gamma[k] @ base + ends @ transients
+        linear = moved * load + g[0] * (ends @ transients)
         if not slopes:
-            return np.asarray(spectra - (modes.gamma[k] @ base + g[0] * load))
+            return np.asarray(spectra - linear)
         for at in (1, 6 + d + law.form.size)[: 2 - (law.level_of is None)]:
             spectra[at : at + 2] = np.zeros((2, w.size)) if rest else spectra[[at + 1, at]]
-        linear = [modes.gamma[k] @ base + g[0] * load, *g[0] * transients, *base + g[0] * base]
-        spectra[: 5 + d] -= [*linear, by_omega * load, by_ratio * load]
+        spectra[: 3 + d] -= [linear, *g[0] * transients, *moved * base]
+        spectra[3 + d : 5 + d] -= moved_by_pole * load + by_pole * (ends @ transients)
         return np.asarray(spectra)
 
     def in_run(self, p: Parameters, run: int, law: ModeLaw) -> tuple[Array, Array]:
-        """Level that a law follows, m/s², and restoring acceleration of its mode, both (n,) at the samples of a run."""
-        rows, levels = self._moved(p, run, law, slopes=False)
-        return levels[0, :: self._steps[law.mode]], rows[0]
+        """Level that a law follows, m/s², and restoring acceleration of its mode, both (n,) at the steps of a run."""
+        _, rows, levels = self._moved(p, run, law, slopes=False)
+        return levels[0], rows[0]
 
-    def _moved(self, p: Parameters, run: int, law: ModeLaw, slopes: bool) -> tuple[Array, Array]:
-        """Rows of `motion` at the samples of a run, and its level at all steps; those of the last numbers are kept."""
+    def _moved(self, p: Parameters, run: int, law: ModeLaw, slopes: bool) -> tuple[float, Array, Array]:
+        """Length of a step, s, and both that `motion` gives; those of the last numbers are kept."""
         modes, k, level = p.modes, law.mode, None
-        times, series = self.in_time(run, k, float(modes.omega[k]))
+        step, series = self.in_time(run, k, float(modes.omega[k]))
         if law.level_of is not None:  # straight from step to step of the mode that it is of
-            level, fine = self._moved(p, run, law.moving(p.laws), slopes)[1], np.arange(series.shape[1])
+            level, fine = self._moved(p, run, law.moving(p.laws), slopes)[2], np.arange(series.shape[1])
             at = np.minimum(fine / fine.size * level.shape[1], level.shape[1] - 1.0)
             first = at.astype(int)
             rest = at - first
             level = (1 - rest) * level[:, first] + rest * level[:, np.minimum(first + 1, level.shape[1] - 1)]
         pole = np.log([modes.omega[k], modes.ratios[k], abs(modes.phi[law.sensor, k])])
         numbers, ends = np.append(pole, law.values), self._ends(p, run, k)
-        key = np.concatenate([[times, *law.form], modes.gamma[k], ends, numbers, *(() if level is None else level[:2])])
+        key = np.concatenate([[step, *law.form], modes.gamma[k], ends, numbers, *(() if level is None else level[:2])])
         which = run, k, slopes
         if which not in self._last or not np.array_equal(self._last[which][0], key):
-            load, step = modes.gamma[k] @ series, 1 / (self.rate * times)
-            rows, levels = motion(law.form, load, step, numbers, ends[::-1], series if slopes else None, level)
-            self._last[which] = key, rows[:, ::times], levels
-        return self._last[which][1:]
+            load = modes.gamma[k] @ series
+            found = motion(law.form, load, step, numbers, ends[::-1], series if slopes else None, level)
+            self._last[which] = key, *found
+        return step, *self._last[which][1:]
 
     def _ends(self, p: Parameters, run: int, mode: int) -> Array:
         """Numbers of the ends of a run of a mode, (2,)."""
@@ -110,8 +116,20 @@ class LawMotions:
 def _motions_of(
     test: Measurement,
 ) -> tuple[dict[tuple[int, int], Array], dict[tuple[int, int, bool], tuple[Array, Array, Array]]]:
-    """Motions of the base, by run and steps a sample; last ones of modes, by run, mode, and whether with slopes."""
+    """Motions of the base, by run and number of steps; last ones of modes, by run, mode, and whether with slopes."""
     return {}, {}
+
+
+def _in_steps(freq: Array, pole: Array, step: float, images: int = 2) -> tuple[ComplexArray, ComplexArray]:
+    """Restoring acceleration of a linear mode under a load of one that is straight over steps, (L,); slopes, (2, L).
+
+    At its ends they show such a load's `images`, about multiples of the rate of steps, at the line that it is of.
+    """
+    fold = np.arange(-images, images + 1)[:, None] / step
+    share = (freq / (freq + fold)) ** 2
+    g, slopes = gains_and_slopes((freq + fold).ravel(), *pole)
+    moved = np.sum(share * (1 + g[0]).reshape(share.shape), axis=0)
+    return moved, np.sum(share * slopes.reshape(2, *share.shape), axis=1)
 
 
 def linear_modes(p: Parameters, run: int) -> Modes:
