@@ -26,8 +26,10 @@ from sysid.modal_analysis.amplitude_fit import (
 )
 from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.law_spectra import LawMotions
 from sysid.modal_analysis.misfit import left_of
-from sysid.modal_analysis.modal_model import ModeLaw
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_model import ModeLaw, Parameters
 from sysid.modal_analysis.record_fit import ROUGH, WHOLE, Limits, record_modes, refitted
 from sysid.results.judgement import _of_its_modes
 from sysid.structure.amplitude import LawForm
@@ -87,6 +89,27 @@ def test_the_gradient_of_the_fit_is_that_of_differences(test, form, at_rest, mod
         difference = (8 * (chi2(0.3) - chi2(-0.3)) - (chi2(0.6) - chi2(-0.6))) / 3.6
         size = 2 * np.abs(exact.gradient * step).sum()  # terms may cancel down to the round-off of differences
         assert difference == pytest.approx(-2 * exact.gradient @ step, abs=1e-6 * size)
+
+
+@pytest.mark.parametrize("hertz", [3.5, 9.0])
+@pytest.mark.parametrize("fall, within", [(0.0, 1e-4), (0.2, 1e-3)])
+def test_what_a_law_adds_does_not_depend_on_its_steps(hertz, fall, within):
+    """Of a burst of noise up to 48 Hz, sampled at 120 Hz: nothing where the law changes nothing, images of lines off.
+
+    What such a load holds beyond its lines moves a mode of 9 Hz by some thousandths of the base's motion.
+    """
+    rng, rate, n = np.random.default_rng(0), 120.0, 4800
+    white = np.convolve(rng.normal(size=n), np.sinc(0.8 * np.arange(-60, 61)) * np.hanning(121), "same")
+    burst, freq = white * np.exp(-(((np.arange(n) / rate - 5.0) / 1.2) ** 2)), np.arange(1, 2300) * rate / n
+    base = np.fft.rfft(burst)[None, None, 1:2300] / rate
+    short = sysid.Measurement(freq, base, base.copy(), rigid_body=[[1.0]], sample_rate=rate)
+    modes = Modes(np.ones((1, 1)), np.array([[1.3]]), 2 * np.pi * np.array([hertz]), np.array([0.03]))
+    p = Parameters(modes, np.eye(1), np.zeros((1, 0)), np.zeros(0))
+    law = ModeLaw(0, 0, LawForm(1.0, 1.0, 10 * np.std(burst)), np.array([fall, fall / 5]), np.ones((1, 2)))
+    coarse, fine = (LawMotions(short, *steps).of_run(p, 0, law)[0] for steps in ((16.0, 3.0), (96.0, 24.0)))
+    size = np.linalg.norm(base)
+    assert np.linalg.norm(coarse - fine) < within * size
+    assert np.linalg.norm(fine) > size if fall else np.linalg.norm(fine) < 1e-3 * size
 
 
 def test_the_law_is_found_within_its_deviations(answer):
