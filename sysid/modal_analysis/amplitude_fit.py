@@ -17,6 +17,7 @@ from sysid.modal_analysis.least_squares import half_inverse, unit_diagonal
 from sysid.modal_analysis.misfit import at_lines, left_of
 from sysid.modal_analysis.modal_fit import Modes, modes_within
 from sysid.modal_analysis.modal_model import ModeLaw, Parameters
+from sysid.modal_analysis.model_order import least_worth, peaks_of, with_peaks
 from sysid.modal_analysis.record_fit import ROUGH, TRIAL, WHOLE, Limits, RecordFit, as_one, refitted, rough_levels
 from sysid.modal_analysis.residues import line_correlation
 from sysid.structure.amplitude import MOST_DAMPED, OF_DAMPING, OF_FREQUENCY, AmplitudeLaw, FittedLaw, LawForm
@@ -94,6 +95,7 @@ def _stages(
         if none_left or (stated.modes == "auto" and not best.parameters.laws):
             break
     if plain and best.parameters.laws:
+        best = _with_hidden_modes(best, monitor)
         best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
         if left_of(best) < much:
             monitor.doing, most = "noise of all channels", 1.1 * left_of(best)
@@ -108,6 +110,18 @@ def _stages(
         best, gone = _holding(best, linear, limits if best.model.whole.plain else WHOLE, monitor)
         left_out += gone
     yield replace(best if best.parameters.laws else fit, left_out=tuple(left_out))
+
+
+def _with_hidden_modes(fit: RecordFit, monitor: FitMonitor, reach: float = 0.2) -> RecordFit:
+    """The fit with further modes that what a linear model missed had hidden, farther from all than laws move modes."""
+    while True:
+        omega = fit.parameters.modes.omega
+        peaks = peaks_of(fit, least_worth(fit.model))
+        peaks = [one for one in peaks if np.min(np.abs(np.log(omega / one.omega))) > reach]
+        more = with_peaks(fit, peaks[:1], None, monitor) if peaks else None
+        if more is None or not _is_likelier(more, fit, more.model.unknowns - fit.model.unknowns):
+            return fit
+        fit = more
 
 
 def _with_noise(fit: RecordFit, p: Parameters, limits: Limits, monitor: FitMonitor) -> RecordFit:

@@ -56,16 +56,16 @@ def with_further_modes(fit: RecordFit, *, monitor: FitMonitor, some: Measurement
         beside_all = fit.static and fit.parameters.coupling is None  # poles above the lines came with static modes
         most = 2 * np.pi * fit.test.freq[-1] if beside_all else np.inf
         peaks = peaks_of(fit, least_worth(fit.model), within=(0.0, most))[: fit.model.m]
-        more = _with_peaks(fit, peaks, some, monitor)
+        more = with_peaks(fit, peaks, some, monitor)
         if more is None and len(peaks) > 1:
-            more = _with_peaks(fit, peaks[:1], some, monitor)
+            more = with_peaks(fit, peaks[:1], some, monitor)
         if more is None:
             return fit
         fit = more
         monitor.keep(fit)
 
 
-def _with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, monitor: FitMonitor) -> RecordFit | None:
+def with_peaks(fit: RecordFit, peaks: list[Peak], some: Measurement | None, monitor: FitMonitor) -> RecordFit | None:
     """The fit with modes at these peaks, less those that a few steps show to be worth too little; None without any."""
     least, m, p = least_worth(fit.model), fit.model.m, fit.parameters
     for peak in peaks:
