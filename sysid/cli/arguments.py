@@ -368,7 +368,8 @@ def _add_problem(command: argparse.ArgumentParser, *, optional: bool = False) ->
     """Give a command the problem module, which may be `optional`, and what is handed on to it."""
     command.add_argument(
         "problem", metavar="PROBLEM", nargs="?" if optional else None,
-        help="a path to a module (.py), else a module in ./problems, else a bundled problem, else a dotted module",
+        help="a path to a module (.py), else a module in ./problems, else a bundled problem, else a dotted module"
+        + "; or the path to a test that 'sysid read' wrote" * optional,
     )  # fmt: skip
     command.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
     command.set_defaults(modes=None, dofs=())

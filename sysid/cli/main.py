@@ -163,8 +163,9 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         words, figures = summary_and_figures(result, left(GRACE))
         out.write(f"\n{words}\n\n{replaced}")
         out.answer(result=figures)
-        if out.quiet and not result.success:
-            out.warn(f"no fit: {result.undetermined[0]}")
+        if out.quiet:  # words tell the same
+            for wrong in result.contradictions if result.success else [f"no fit: {result.undetermined[0]}"]:
+                out.warn(wrong)
         out.flush()
         if failed is not None:
             raise failed

@@ -1,6 +1,7 @@
 """``--modes`` and ``--dofs``: so many modes, on these sensors, of a run, of jobs about its result, and side by side."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
+from sysid.files import recorded_test
 from sysid.files.recorded_test import RecordedTest
 from sysid.results.checkpoint import RunRequest
 
@@ -91,6 +93,17 @@ def test_fewer_modes_than_the_lines_hold_are_obeyed_and_kept_by_jobs(folder, fil
     rows = json.loads(capsys.readouterr().out)["identifications"]
     assert [row["score"]["modes"] for row in rows] == [1, 1]
     assert rows[0]["title"] == "test.h5, 1 mode"
+
+
+def test_quiet_names_a_sensor_of_the_other_sign(folder, file, capsys):
+    test = recorded_test.load(file)
+    ((base, response, force),) = test.runs
+    turned = np.where(np.arange(len(response)) == 1, -1.0, 1.0)[:, None] * response
+    Path("turned.h5").write_bytes(replace(test, runs=((base, turned, force),)).to_bytes())
+    assert cli.main(["run", "turned.h5", "--out", "out", "--quiet"]) == 1
+    out, error = capsys.readouterr()
+    assert out == "" and all(line.startswith("sysid: warning: ") for line in error.splitlines())
+    assert NAMES[1] in error and not any(name in error for name in NAMES if name != NAMES[1])
 
 
 def test_draws_of_an_answer_in_the_band_keep_its_modes_and_sensors(folder, file, capsys):

@@ -250,7 +250,7 @@ def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
     unit = next((one for one in _UNITS if abs(factor / one[0] - 1) < _LIKE), None)
     kind: Kind | None = None
     if abs(factor + 1) < _GROSS:
-        kind, remedy = "sign", "change its sign"
+        kind, remedy = "sign", 'change its sign, or its axis in sensors.toml ("-x" in place of "x")'
         sentence = f"the sign of {name} is reversed: {seen} by {factor:.3g} times what rigid_body says"
     elif unit is not None:
         _, times, small, large = unit
