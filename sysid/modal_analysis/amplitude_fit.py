@@ -96,7 +96,6 @@ def _stages(
             break
     if plain and best.parameters.laws:
         best = _with_hidden_modes(best, monitor)
-        best = refitted(best, _with_equivalents(best), limits=TRIAL, monitor=monitor)
         if left_of(best) < much:
             monitor.doing, most = "noise of all channels", 1.1 * left_of(best)
             noisy = _with_noise(best, _with_equivalents(best), ROUGH, monitor)
@@ -118,9 +117,9 @@ def _with_hidden_modes(fit: RecordFit, monitor: FitMonitor, reach: float = 0.2) 
         omega = fit.parameters.modes.omega
         peaks = peaks_of(fit, least_worth(fit.model))
         peaks = [one for one in peaks if np.min(np.abs(np.log(omega / one.omega))) > reach]
-        more = with_peaks(fit, peaks[:1], None, monitor) if peaks else None
+        more = with_peaks(fit, peaks[:1], None, monitor)
         if more is None or not _is_likelier(more, fit, more.model.unknowns - fit.model.unknowns):
-            return fit
+            return refitted(fit, _with_equivalents(fit), limits=TRIAL, monitor=monitor)
         fit = more
 
 

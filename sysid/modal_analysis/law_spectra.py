@@ -47,11 +47,11 @@ class LawMotions:
 
     def in_time(self, run: int, mode: int, omega: float) -> tuple[float, Array]:
         """Length of a step, s, and motion of the base (d, n) whose straight lines over steps have the run's lines."""
-        if mode not in self._steps:  # as a fit goes on they stay, within a twelfth of an octave
-            finer = max(math.log2(self.per_period * omega / (2 * np.pi) / self.least), 0.0)
-            self._steps[mode] = self.least * 2 ** (math.ceil(12 * finer) / 12)
+        finer = max(math.log2(self.per_period * omega / (2 * np.pi) / self.least), 0.0)
+        # Within a twelfth of an octave they stay the same from fit to fit.
+        rate = self._steps.setdefault(mode, self.least * 2 ** (math.ceil(12 * finer) / 12))
         duration = self.samples[run] / self.rate
-        steps = math.ceil(duration * self._steps[mode])
+        steps = math.ceil(duration * rate)
         if (run, steps) not in self._series:
             spectrum = np.zeros((len(self.base[run]), steps // 2 + 1), complex)
             straight = np.sinc(self.lines[run] * duration / steps) ** 2
