@@ -34,6 +34,7 @@ from sysid.cli.output import (
     save,
     summary_and_figures,
     write_pages,
+    wrong_in_words,
 )
 from sysid.cli.starting import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
@@ -163,9 +164,8 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         words, figures = summary_and_figures(result, left(GRACE))
         out.write(f"\n{words}\n\n{replaced}")
         out.answer(result=figures)
-        if out.quiet:  # words tell the same
-            for wrong in result.contradictions if result.success else [f"no fit: {result.undetermined[0]}"]:
-                out.warn(wrong)
+        for wrong in wrong_in_words(result) if out.quiet else ():  # the words tell it
+            out.warn(wrong)
         out.flush()
         if failed is not None:
             raise failed

@@ -354,6 +354,11 @@ def replaced_in_words(result: Identification, folder: Path) -> str:
     return f"replaces the result of strategy {before} in {folder}\n" * (before != result.strategy)
 
 
+def wrong_in_words(result: Identification) -> list[str]:
+    """What contradicts the records, a sentence each, or that there is no fit."""
+    return [str(one) for one in result.contradictions] if result.success else [f"no fit: {result.undetermined[0]}"]
+
+
 def summary_and_figures(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
     """Summary and figures of a result; without what takes more than the seconds that are `left`."""
     try:
