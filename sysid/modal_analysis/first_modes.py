@@ -61,29 +61,31 @@ def _without_wrong_sensors(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     modes tells most of, and so on.
     """
     while True:
-        worth, added = _motion_beside(fit)
-        sensor, constants = int(np.argmax(worth)), np.zeros(added.shape)
-        if not _is_mistake(fit.test.rigid_body, fit.constants[sensor] + added[sensor], sensor):
+        (worth, added), G = _motion_beside(fit), fit.test.rigid_body
+        sensor, constants = int(np.argmax(worth)), fit.constants.copy()
+        moved = _moved_by_mistake(G, sensor, G[sensor] + constants[sensor] + added[sensor])
+        if moved is None:
             return fit
-        constants[sensor] = added[sensor]
-        right = replace(fit, test=without_constants(fit.test, constants))
+        constants[sensor] = moved - G[sensor]
+        right = replace(fit, test=without_constants(fit.test, constants - fit.constants))
         trial = refitted(right, fit.parameters, limits=_NEAR, monitor=monitor)
         if trial.schwarz - fit.schwarz < 25.0 * np.count_nonzero(added[sensor]) * np.log(fit.model.numbers) / 2:
             return fit
         fit = trial
 
 
-def _is_mistake(G: Array, added: Array, sensor: int, near: float = 0.1) -> bool:
-    """True where a share of the base's motion, (d,), turns a sensor's about, takes it away, or puts another in place.
+def _moved_by_mistake(G: Array, sensor: int, moved: Array, near: float = 0.1) -> Array | None:
+    """How the base moves a sensor of wrong sign or axis, (d,), where it does so but for `near` of it; else None.
 
-    But for `near` of it. What a mode below the lines or a wrong gain adds is left to the fit of all modes.
+    Not at all, the other way about, or as much in another direction: what modes below or gains add is left to others.
     """
-    size = np.linalg.norm(G, axis=1)
-    stated, moved = G[sensor], G[sensor] + added
-    usual, along = size[sensor] or size.max(), float(stated @ moved)
-    turned = np.linalg.norm(moved + stated) < near * usual
-    across = abs(along) <= near * usual**2 and abs(np.linalg.norm(moved) / usual - 1) < near
-    return bool(turned or across or np.linalg.norm(moved) < near * usual)
+    size, stated = np.linalg.norm(G, axis=1), G[sensor]
+    usual = size[sensor] or size.max()
+    as_much = moved * usual / max(float(np.linalg.norm(moved)), ROUND_OFF)
+    likely = np.array([0 * stated, -stated, as_much])
+    off = np.linalg.norm(likely - moved, axis=1)
+    off[2] = max(off[2], abs(stated @ as_much) / usual)
+    return likely[np.argmin(off)] if off.min() < near * usual else None
 
 
 def _motion_beside(fit: RecordFit) -> tuple[Array, Array]:

@@ -326,7 +326,7 @@ def test_what_a_wrong_sign_or_axis_adds_is_no_mode(records, plain, mistake, tmp_
     wrong = misread(records, -2.0 * np.eye(6)[2]) if mistake == "sign" else other_axis(records, 2)
     first = first_modes(wrong, np.zeros(5), FitMonitor())[1]
     adds = (-2.0 if mistake == "sign" else 1.0) * np.outer(np.arange(4) == 2, records.rigid_body[2])
-    np.testing.assert_allclose(first.constants, adds, atol=0.05)
+    np.testing.assert_allclose(first.constants, adds, rtol=1e-12)
     result, right = sysid.identify(Problem(wrong), rng=0), plain["records"]
     assert {one.channel for one in result.contradictions} == {"sensor 3"} and not result.structure.residual.count
     np.testing.assert_array_equal(result.modal[0].record_fit.constants, first.constants)
@@ -344,8 +344,7 @@ def test_what_a_wrong_sign_or_axis_adds_is_no_mode(records, plain, mistake, tmp_
 def test_two_wrong_sensors_are_taken_off_one_by_one(records):
     wrong = other_axis(misread(records, -2.0 * np.eye(6)[0]), 3)
     first = first_modes(wrong, np.zeros(5), FitMonitor())[1]
-    np.testing.assert_allclose(first.constants[:, 0], [-2.0, 0.0, 0.0, 1.0], atol=0.05)
-    assert not np.any(first.constants[1:3])
+    np.testing.assert_allclose(first.constants[:, 0], [-2.0, 0.0, 0.0, 1.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("size", [-0.3, -0.05, 0.05, 0.3])

@@ -68,10 +68,11 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (1 + velocity):
         return leaks
     free = records.fit(*poles, velocity=velocity)
-    taken = modal.record_fit is not None and np.any(modal.record_fit.constants)  # what was taken off has to be told
+    fit = modal.record_fit
+    taken = fit is not None and np.any(fit.constants != fit.of_axes)  # what was taken off has to be told
     errors = gain_errors(modal, structure) if taken or not changing else None  # which changes would explain
     misses = list(_misfit(formulation, test, structure, records, free))
-    rigid = [] if changing else list(_rigid(modal, records, free, structure))
+    rigid = list(_rigid(modal, records, free, changing or below_lines(test, structure).size > 0, structure.residual))
     gains = [] if (rigid and not taken) or errors is None else list(wrong_gains(test, errors, structure))
     gains = [one for one in gains if one.channel not in {it.channel for it in rigid}]  # a sign or an axis is no gain
     of_force = force_misfit(formulation, test, structure, modal.calibration)
@@ -126,11 +127,16 @@ def _misfit(
         )  # fmt: skip
 
 
-def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit, structure: Structure) -> Iterator[Finding]:
-    """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
+def _rigid(
+    modal: ModalEstimate, records: Records, free: ResidueFit, others: bool, residual: ResidualModes
+) -> Iterator[Finding]:
+    """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong.
+
+    Where `others` make all move so, as modes below the lines do, what is of one sensor alone.
+    """
     test, fit = modal.records, modal.record_fit
-    if below_lines(test, structure).size:  # which move all in such a proportion, but for what is of one sensor alone
-        moved = fit.of_axes if fit is not None else _of_one_sensor(structure.residual, test.freq)
+    if others:
+        moved = fit.of_axes if fit is not None else _of_one_sensor(residual, test.freq)
         chi2 = np.full(test.n_sensors, np.inf)
     elif modal.of_records:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
