@@ -71,7 +71,8 @@ def _without_wrong_sensors(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
         trial = refitted(right, fit.parameters, limits=_NEAR, monitor=monitor)
         if trial.schwarz - fit.schwarz < 25.0 * np.count_nonzero(added[sensor]) * np.log(fit.model.numbers) / 2:
             return fit
-        fit = trial
+        # What was found of modes beside the mistake are some of them.
+        fit = max(trial, near_fit(trial.test, monitor), key=lambda one: one.schwarz)
 
 
 def _moved_by_mistake(G: Array, sensor: int, moved: Array, near: float = 0.1) -> Array | None:
